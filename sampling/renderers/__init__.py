@@ -1,0 +1,5 @@
+"""What the sampler renders with."""
+
+from sampling.renderers.protocol import Renderer, Samples
+
+__all__ = ["Renderer", "Samples"]

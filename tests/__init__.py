@@ -1,0 +1,1 @@
+"""Tests: the reference, one file a module, then the laws."""

@@ -1,0 +1,47 @@
+"""Where test data lives, and what images tests are made of."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from numpy.typing import NDArray
+
+settings.register_profile("default", deadline=None, derandomize=True, max_examples=40)
+settings.load_profile("default")
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Return the folder of shared data; a test that needs it is skipped where it is missing."""
+    folder = Path(os.environ.get("TORCH_VDM_DATA", ROOT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no shared data at {folder}: set TORCH_VDM_DATA to its folder")
+    return folder
+
+
+KINDS = ("random", "flat", "black", "hdr", "dark", "negative")
+
+
+def make_xyz(kind: str, height: int, width: int, seed: int) -> NDArray[np.float64]:
+    """Return an image (3, H, W) of absolute XYZ in cd/m2."""
+    rng = np.random.default_rng(seed)
+    shape = (3, height, width)
+    match kind:
+        case "random":
+            return rng.uniform(1.0, 100.0, shape)
+        case "flat":
+            return np.broadcast_to(rng.uniform(1.0, 100.0, (3, 1, 1)), shape).copy()
+        case "black":
+            return np.zeros(shape)
+        case "hdr":
+            return np.exp(rng.normal(2.0, 3.0, shape))
+        case "dark":
+            return rng.uniform(0.0, 1e-3, shape)
+        case "negative":
+            return rng.uniform(-0.5, 20.0, shape)
+        case _:
+            raise ValueError(kind)

@@ -1,0 +1,20 @@
+"""The JND meter for images that are computed: a visual difference metric in PyTorch."""
+
+from torch_vdm.cortex import Haar
+from torch_vdm.display import Display, pixels_per_degree
+from torch_vdm.effects import Effects
+from torch_vdm.loss import VDMLoss
+from torch_vdm.observer import Observer
+from torch_vdm.vdm import VDM
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "VDM",
+    "Display",
+    "Effects",
+    "Haar",
+    "Observer",
+    "VDMLoss",
+    "pixels_per_degree",
+]

@@ -1,0 +1,336 @@
+"""The command line, ``torch-vdm``."""
+
+import argparse
+import math
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import NoReturn
+
+import torch
+from torch import Tensor
+
+from torch_vdm import __version__
+from torch_vdm.display import BT709_TO_XYZ, Display, decode_srgb, pixels_per_degree
+from torch_vdm.io import ImageError, atomic_path, load, write_image
+from torch_vdm.observer import Observer
+from torch_vdm.report import Comparison, encode_srgb, figures, table, write_heat_map
+from torch_vdm.vdm import VDM
+
+DONE, EXCEEDED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+# Assumed where nothing is given; each is printed. Status: choice. 60 pixels per degree is a
+# 27-inch screen of 3840 x 2160 from 0.53 m; 100 cd/m2 is the white of BT.1886 and Display.srgb.
+PPD = 60.0
+WHITE = 100.0
+
+OBSERVERS = {"calibrated": Observer.calibrated, "paper": Observer.paper}
+
+
+class _UsageError(ValueError):
+    """Options that do not fit together."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
+        raise SystemExit(BAD_INPUT)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``torch-vdm``; return its exit status."""
+    options = _parser().parse_args(arguments)
+    try:
+        if options.command == "demo":
+            sample = files("torch_vdm") / "sample"
+            with as_file(sample / "reference.exr") as one, as_file(sample / "test.exr") as other:
+                return _compare(one, other, options)
+        return _compare(options.reference, options.test, options)
+    except (ImageError, _UsageError) as error:
+        print(f"torch-vdm: {error}", file=sys.stderr)
+    except OSError as error:
+        print(f"torch-vdm: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
+    except KeyboardInterrupt:
+        print("torch-vdm: interrupted; nothing was written", file=sys.stderr)
+        return INTERRUPTED
+    return BAD_INPUT
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="torch-vdm",
+        description="Tell whether anybody can see the difference between two images, and where.",
+    )
+    parser.add_argument("--version", action="version", version=f"torch-vdm {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    compare = commands.add_parser(
+        "compare",
+        help="compare a test image with a reference",
+        description="Compare two images of one size, PNG, JPEG or EXR, in just-noticeable "
+        "differences. Exit status: 0 done, 1 --fail-above exceeded, 2 bad input.",
+    )
+    compare.add_argument("reference", type=Path, metavar="REFERENCE")
+    compare.add_argument("test", type=Path, metavar="TEST")
+    demo = commands.add_parser(
+        "demo",
+        help="compare a sample pair that ships with the package",
+        description="Compare a path-traced picture with its noisy preview: a pair that ships "
+        "with the package.",
+    )
+    for command in (compare, demo):
+        _add_options(command, Path("torch-vdm-demo.png") if command is demo else None)
+    return parser
+
+
+def _add_options(parser: argparse.ArgumentParser, map_path: Path | None) -> None:
+    view = parser.add_argument_group("viewing")
+    view.add_argument("--ppd", type=_positive, metavar="F", help=f"pixels per degree ({PPD:g})")
+    view.add_argument(
+        "--screen", type=_resolution, metavar="WxH", help="instead of --ppd: the screen's pixels"
+    )
+    view.add_argument("--diagonal", type=_positive, metavar="INCHES", help="its diagonal")
+    view.add_argument("--distance", type=_positive, metavar="METRES", help="from eye to screen")
+    light = parser.add_argument_group("light")
+    light.add_argument(
+        "--peak",
+        type=_positive,
+        default=WHITE,
+        metavar="CD_M2",
+        help=f"luminance of white in PNG and JPEG ({WHITE:g})",
+    )
+    light.add_argument(
+        "--white",
+        type=_positive,
+        default=WHITE,
+        metavar="CD_M2",
+        help=f"luminance of 1.0 in EXR ({WHITE:g})",
+    )
+    light.add_argument(
+        "--exposure", type=_stops, default=0.0, metavar="STOPS", help="multiply the light by 2^F"
+    )
+    model = parser.add_argument_group("model")
+    model.add_argument("--accuracy", choices=("fast",), default="fast")
+    model.add_argument("--observer", choices=tuple(OBSERVERS), default="calibrated")
+    reading = parser.add_argument_group("reading")
+    reading.add_argument("--part", metavar="NAME", help="part of a multi-part EXR, name or number")
+    reading.add_argument("--nonfinite", choices=("raise", "zero"), default="raise")
+    reading.add_argument("--negative", choices=("raise", "clip", "keep"), default="raise")
+    output = parser.add_argument_group("output")
+    output.add_argument(
+        "--map", type=_map_path, default=map_path, metavar="OUT.png|OUT.exr", help="the heat map"
+    )
+    output.add_argument("--json", metavar="OUT.json|-", help="the figures; - prints them alone")
+    output.add_argument(
+        "--fail-above", type=_jnd, metavar="JND", help="exit with 1 where the maximum is larger"
+    )
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Two images made ready for one display."""
+
+    reference: Tensor
+    test: Tensor
+    display: Display
+    assumptions: list[str]
+
+    def luminances(self) -> tuple[float, float]:
+        """Return the mean luminance of reference and test, in cd/m2."""
+        matrix = torch.tensor(BT709_TO_XYZ, dtype=torch.float64)
+        reference, test = (
+            self.display.to_xyz(image[None].double(), matrix)[0, 1].mean().item()
+            for image in (self.reference, self.test)
+        )
+        return reference, test
+
+    def coded(self) -> tuple[Tensor, Tensor]:
+        """Return reference and test as sRGB-coded images, for a picture of them."""
+        if self.display.encoding == "srgb" and self.display.exposure == 0.0:
+            return self.reference, self.test
+        scale = 2.0**self.display.exposure
+        linear = (
+            decode_srgb(image) if self.display.encoding == "srgb" else image
+            for image in (self.reference, self.test)
+        )
+        reference, test = (encode_srgb(image * scale) for image in linear)
+        return reference, test
+
+
+def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
+    ppd, seen_from = _viewing(options)
+    pair = _load_pair(reference, test, options)
+    metric = VDM(ppd, pair.display, OBSERVERS[options.observer]())
+    start = time.perf_counter()
+    with torch.no_grad():
+        batch = pair.test[None], pair.reference[None]
+        jnd = metric(*batch)[0, 0]
+        score = metric.score(*batch).item()
+    seconds = time.perf_counter() - start
+    luminances = pair.luminances()
+    comparison = Comparison(
+        **figures(jnd),
+        score_jnd=score,
+        mean_luminance_change=luminances[1] / luminances[0] - 1.0 if luminances[0] else None,
+        width=jnd.shape[1],
+        height=jnd.shape[0],
+        ppd=ppd,
+        accuracy=options.accuracy,
+        observer=options.observer,
+        effects=metric.effects.names(),
+        seconds=seconds,
+        assumptions=[seen_from, *pair.assumptions],
+        version=__version__,
+        reproduce=_reproduce(reference, test, ppd, options),
+    )
+    if options.map is not None and options.map.suffix.lower() == ".exr":
+        write_image(options.map, jnd)
+    elif options.map is not None:
+        write_heat_map(options.map, *pair.coded(), jnd, comparison.verdict())
+    if options.json == "-":
+        sys.stdout.write(comparison.to_json())
+    else:
+        if options.json is not None:
+            with atomic_path(Path(options.json)) as temporary:
+                temporary.write_text(comparison.to_json())
+        _print(comparison, luminances, options)
+    exceeded = options.fail_above is not None and comparison.max_jnd > options.fail_above
+    return EXCEEDED if exceeded else DONE
+
+
+def _viewing(options: argparse.Namespace) -> tuple[float, str]:
+    """Return pixels per degree, and in words where they come from."""
+    geometry = (options.screen, options.diagonal, options.distance)
+    given = [part for part in geometry if part is not None]
+    if given and (options.ppd is not None or len(given) < 3):
+        raise _UsageError(
+            "expected --ppd alone, or --screen, --diagonal and --distance together; "
+            "give one of the two"
+        )
+    if given:
+        ppd = pixels_per_degree(*geometry)
+        return ppd, (
+            f"{ppd:.4g} pixels per degree: {options.screen[0]} x {options.screen[1]} pixels on "
+            f"{options.diagonal:g} inches from {options.distance:g} m"
+        )
+    if options.ppd is not None:
+        return options.ppd, f"{options.ppd:g} pixels per degree (--ppd)"
+    return PPD, f"{PPD:g} pixels per degree (assumed; --ppd)"
+
+
+def _load_pair(reference: Path, test: Path, options: argparse.Namespace) -> _Pair:
+    """Read both images and bring them to one display."""
+    images = [
+        load(
+            path,
+            part=_part(options.part),
+            nonfinite=options.nonfinite,
+            negative=options.negative,
+            quiet=True,
+        )
+        for path in (reference, test)
+    ]
+    shapes = [tuple(image.pixels.shape) for image in images]
+    if shapes[0] != shapes[1]:
+        sizes = [f"{shape[2]} x {shape[1]}" for shape in shapes]
+        raise ImageError(
+            f"{test}: expected the size of {reference}, {sizes[0]}, got {sizes[1]}; "
+            "crop or scale one of them"
+        )
+    assumptions = []
+    if any(image.linear for image in images):
+        assumptions.append(f"EXR is linear BT.709, and 1.0 is {options.white:g} cd/m2 (--white)")
+    if not all(image.linear for image in images):
+        assumptions.append(f"PNG and JPEG are sRGB, and white is {options.peak:g} cd/m2 (--peak)")
+    assumptions.append(f"exposure {options.exposure:+g} stops (--exposure)")
+    for path, image in zip((reference, test), images, strict=True):
+        assumptions += [f"{path.name}: {note}" for note in image.notes]
+    if not any(image.linear for image in images):
+        display = Display.srgb(options.peak, options.exposure)
+        return _Pair(images[0].pixels, images[1].pixels, display, assumptions)
+    one, other = (
+        image.pixels if image.linear else decode_srgb(image.pixels) * (options.peak / options.white)
+        for image in images
+    )
+    return _Pair(one, other, Display.linear(options.white, options.exposure), assumptions)
+
+
+def _reproduce(reference: Path, test: Path, ppd: float, options: argparse.Namespace) -> str:
+    """Return the command that gives the same figures, with nothing left to defaults."""
+    words = ["torch-vdm", "compare", str(reference), str(test)]
+    words += ["--ppd", repr(ppd), "--peak", repr(options.peak), "--white", repr(options.white)]
+    words += ["--exposure", repr(options.exposure), "--accuracy", options.accuracy]
+    words += ["--observer", options.observer, "--nonfinite", options.nonfinite]
+    words += ["--negative", options.negative]
+    if options.part is not None:
+        words += ["--part", options.part]
+    return shlex.join(words)
+
+
+def _print(
+    comparison: Comparison, luminances: tuple[float, float], options: argparse.Namespace
+) -> None:
+    """Print the table, the verdict, what was assumed and what was written."""
+    from rich.console import Console
+
+    # Plain text: nothing in a path is markup, and no number is coloured.
+    console = Console(highlight=False, markup=False, soft_wrap=True)
+    console.print(table(comparison, luminances))
+    console.print(comparison.verdict(), style="bold")
+    if options.observer == "paper" and luminances[0] != luminances[1]:
+        console.print(
+            "The mean luminances differ, and the paper's observer never sees a uniform change; "
+            "--observer calibrated does."
+        )
+    console.print()
+    for assumption in comparison.assumptions:
+        console.print(f"assumed: {assumption}", style="dim")
+    for path in (options.map, options.json):
+        if path is not None:
+            console.print(f"written: {path}", style="dim")
+
+
+def _part(text: str | None) -> int | str | None:
+    return int(text) if text is not None and text.isdecimal() else text
+
+
+def _number(text: str, what: str, low: float, high: float = math.inf) -> float:
+    """Return ``text`` as a finite number over ``low`` and at most ``high``."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (low < value <= high and math.isfinite(value)):
+        raise argparse.ArgumentTypeError(f"expected {what}, got {text!r}")
+    return value
+
+
+def _positive(text: str) -> float:
+    return _number(text, "a number over 0", 0.0)
+
+
+def _jnd(text: str) -> float:
+    return _number(text, "a number of JND, 0 or more", -math.ulp(0.0))
+
+
+def _stops(text: str) -> float:
+    return _number(text, "a number of stops between -32 and 32", math.nextafter(-32.0, -64.0), 32.0)
+
+
+def _resolution(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT in pixels, got {text!r}")
+    return int(width), int(height)
+
+
+def _map_path(text: str) -> Path:
+    path = Path(text)
+    if path.suffix.lower() not in (".png", ".exr"):
+        raise argparse.ArgumentTypeError(f"expected a file name in .png or .exr, got {text!r}")
+    return path

@@ -1,0 +1,60 @@
+"""Local contrast and opponents contrast space, the fourth and fifth boxes of Fig. 2."""
+
+from torch import Tensor
+
+from torch_vdm.matrix import mix
+
+# Rows A, C1, C2; columns S, M, L. Unit: opponent contrast per cone contrast. Source: Eq. 3 of
+# Bolin and Meyer 1999, after Meyer 1988. Status: printed. It is not opponent on cone contrasts:
+# a grey contrast of 1 gives A = 1.0147, C1 = 0.4150, C2 = 0.8904.
+SML_TO_OPPONENTS = (
+    (0.0001, 0.2499, 0.7647),
+    (0.0018, 2.9468, -2.5336),
+    (1.0111, -0.3877, 0.2670),
+)
+
+
+def adapted(lowpass: Tensor, dark_light: Tensor) -> Tensor:
+    """Return what the cones are adapted to: their lowpass above 0 plus the eye's dark light.
+
+    ``lowpass`` is (B, 3, h, w) and may be slightly negative (light out of gamut);
+    ``dark_light`` is (3,), in cone responses. The result is positive: no division by it fails.
+    """
+    return lowpass.clamp_min(0.0) + dark_light.view(3, 1, 1)
+
+
+def local_contrast(details: Tensor, adaptation: Tensor) -> Tensor:
+    """Divide the details by the adapted lowpass one level up (Section 2, "local contrast").
+
+    Parameters
+    ----------
+    details
+        (B, 3, orientations, h, w); cones S, M, L.
+    adaptation
+        (B, 3, h, w): one over what `adapted` gives for the parent of each node. Not for the
+        nodes themselves: a contrast is at most 4 for light that is not negative.
+
+    Returns
+    -------
+    Tensor
+        (B, 3, orientations, h, w), cone contrast without unit.
+    """
+    return details * adaptation.unsqueeze(2)
+
+
+def weber_contrast(first: Tensor, second: Tensor, dark_light: Tensor) -> Tensor:
+    """Return the contrast between two lowpass planes (B, 3, h, w), relative to their mean.
+
+    Antisymmetric; at most 2 for light that is not negative.
+    """
+    mean = 0.5 * (adapted(first, dark_light) + adapted(second, dark_light))
+    return (first - second) / mean
+
+
+def opponents(contrast: Tensor, matrix: Tensor) -> Tensor:
+    """Return the opponent contrasts A, C1, C2 of cone contrasts (Eq. 3).
+
+    ``contrast`` is (B, 3, ...); ``matrix`` (N, 3) holds the rows of `SML_TO_OPPONENTS` that are
+    wanted; the result is (B, N, ...).
+    """
+    return mix(matrix, contrast)

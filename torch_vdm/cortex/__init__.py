@@ -1,0 +1,6 @@
+"""Cortex filtering, the second box of Fig. 2: an image as frequency and orientation channels."""
+
+from torch_vdm.cortex.haar import Haar
+from torch_vdm.cortex.transform import Cortex, Transform
+
+__all__ = ["Cortex", "Haar", "Transform"]

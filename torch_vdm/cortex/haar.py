@@ -1,0 +1,66 @@
+"""The two-dimensional non-standard Haar decomposition of Eq. 2."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from torch_vdm.cortex.transform import Cortex
+from torch_vdm.quadtree import pad_even
+
+
+@dataclass(frozen=True)
+class Haar:
+    """The paper's transform: O(N), one coefficient a pixel and cone, not shift-invariant."""
+
+    def decompose(self, planes: Tensor) -> Cortex:
+        """Decompose (B, C, H, W) by Eq. 2 down to one node.
+
+        Returns
+        -------
+        Cortex
+            ``details[l]`` is (B, C, 3, h, w): d1 (horizontal), d2 (vertical), d3 (diagonal).
+        """
+        details: list[Tensor] = []
+        lowpass: list[Tensor] = []
+        while max(planes.shape[-2:]) > 1:
+            planes, detail = _analyse(planes)
+            details.append(detail)
+            lowpass.append(planes)
+        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [planes])))
+
+    def peak(self, level_from_finest: int) -> tuple[float, float]:
+        """Return the best frequency of a level, in cycles/pixel, and the gain there."""
+        return _peak(level_from_finest)
+
+
+def _analyse(planes: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the lowpass (B, C, h/2, w/2) and the details (B, C, 3, h/2, w/2) of a plane, Eq. 2."""
+    even = pad_even(planes)
+    top, bottom = even[..., 0::2, :], even[..., 1::2, :]
+    sums, differences = 0.25 * (top + bottom), 0.25 * (top - bottom)
+    left, right = sums[..., 0::2], sums[..., 1::2]
+    upper, lower = differences[..., 0::2], differences[..., 1::2]
+    return left + right, torch.stack((left - right, upper + lower, upper - lower), 2)
+
+
+@lru_cache
+def _peak(level_from_finest: int) -> tuple[float, float]:
+    """Maximise the magnitude of the wavelet's own response.
+
+    A wavelet of 2m pixels, the mean of m pixels minus the mean of the next m, halved, passes the
+    frequency f (cycles/pixel) with sin(pi m f)^2 / (m sin(pi f)). Its greatest maximum is the one
+    between 1/(4m) and 1/(2m), where 2 m sin(pi f) cos(pi m f) - cos(pi f) sin(pi m f), the sign of
+    its slope, passes 0.
+    """
+    m = 2**level_from_finest
+    if m == 1:
+        return 0.5, 1.0
+    low, high = 0.25 / m, 0.5 / m
+    while (middle := 0.5 * (low + high)) not in (low, high):
+        once, many = math.pi * middle, math.pi * m * middle
+        slope = 2.0 * m * math.sin(once) * math.cos(many) - math.cos(once) * math.sin(many)
+        low, high = (middle, high) if slope > 0.0 else (low, middle)
+    return low, math.sin(math.pi * m * low) ** 2 / (m * math.sin(math.pi * low))

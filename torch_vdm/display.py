@@ -1,0 +1,135 @@
+"""From pixel values to light: what the screen shows, and how large a pixel looks."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, Self
+
+import torch
+from torch import Tensor
+
+from torch_vdm.matrix import mix
+
+# Linear BT.709 to CIE XYZ, D65 white of Y = 1. Source: IEC 61966-2-1:1999. Status: source.
+BT709_TO_XYZ = (
+    (0.4124, 0.3576, 0.1805),
+    (0.2126, 0.7152, 0.0722),
+    (0.0193, 0.1192, 0.9505),
+)
+# The sRGB transfer of IEC 61966-2-1: slope and end of the linear part, offset, exponent.
+SRGB_SLOPE, SRGB_KNEE, SRGB_OFFSET, SRGB_EXPONENT = 12.92, 0.04045, 0.055, 2.4
+
+# Light beyond this, in cd/m2, is held to it: the sun's disc has about 1.6e9 cd/m2, and the sum of
+# four pixels must stay finite in float32. Status: choice.
+BRIGHTEST = 1e12
+# The same for sRGB-coded values, whose nominal range is [0, 1]. Status: choice.
+LARGEST_CODE = 1e4
+
+
+@dataclass(frozen=True)
+class Display:
+    """How an image of pixel values becomes light; use `srgb`, `linear` or `xyz`.
+
+    Attributes
+    ----------
+    encoding
+        What the three channels are.
+    white
+        Luminance of the pixel value (1, 1, 1), in cd/m2; 1 for XYZ, which is absolute.
+    exposure
+        Stops; the light is multiplied by 2^exposure.
+    """
+
+    encoding: Literal["srgb", "linear", "xyz"]
+    white: float
+    exposure: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that are no light."""
+        if not (math.isfinite(self.white) and self.white > 0.0):
+            raise ValueError(f"expected a luminance of white over 0 cd/m2, got {self.white}")
+        if not (math.isfinite(self.exposure) and abs(self.exposure) <= 64.0):
+            raise ValueError(f"expected an exposure within 64 stops, got {self.exposure}")
+
+    @classmethod
+    def srgb(cls, peak: float = 100.0, exposure: float = 0.0) -> Self:
+        """Return a display of sRGB-coded values in [0, 1] whose white has ``peak`` cd/m2.
+
+        Values slightly outside [0, 1] are legal: the linear part of the curve goes on below 0
+        and the power above 1.
+        """
+        return cls("srgb", peak, exposure)
+
+    @classmethod
+    def linear(cls, white: float = 100.0, exposure: float = 0.0) -> Self:
+        """Return a display of linear BT.709 where 1.0 is ``white`` cd/m2; values may exceed 1."""
+        return cls("linear", white, exposure)
+
+    @classmethod
+    def xyz(cls) -> Self:
+        """Return the identity: the image is absolute CIE XYZ in cd/m2."""
+        return cls("xyz", 1.0)
+
+    @property
+    def gain(self) -> float:
+        """The factor from linear values to cd/m2."""
+        return self.white * math.exp2(self.exposure)
+
+    def to_xyz(self, image: Tensor, primaries: Tensor) -> Tensor:
+        """Return the absolute CIE XYZ, in cd/m2, of pixel values.
+
+        Parameters
+        ----------
+        image
+            (B, 3, H, W).
+        primaries
+            (3, 3), `BT709_TO_XYZ`; not used for an image that is XYZ.
+
+        Returns
+        -------
+        Tensor
+            (B, 3, H, W), within +-1e12 cd/m2.
+        """
+        if self.encoding == "srgb":
+            image = decode_srgb(image)
+        if self.encoding != "xyz":
+            # The gain goes into nine numbers instead of every pixel.
+            limit = BRIGHTEST / self.gain
+            return mix(primaries * self.gain, image.clamp(-limit, limit))
+        return image.clamp(-BRIGHTEST, BRIGHTEST)
+
+
+def decode_srgb(image: Tensor) -> Tensor:
+    """Return the linear values of sRGB-coded ones (IEC 61966-2-1), 1.0 to 1.0."""
+    image = image.clamp(-LARGEST_CODE, LARGEST_CODE)
+    # The power never sees a base whose gradient is not finite.
+    base = (image.clamp_min(SRGB_KNEE) + SRGB_OFFSET) * (1.0 / (1.0 + SRGB_OFFSET))
+    return torch.where(image <= SRGB_KNEE, image * (1.0 / SRGB_SLOPE), base**SRGB_EXPONENT)
+
+
+def pixels_per_degree(
+    resolution: tuple[int, int], diagonal_inches: float, distance_metres: float
+) -> float:
+    """Return the pixels in one degree at the centre of a screen.
+
+    Parameters
+    ----------
+    resolution
+        Width and height of the screen in pixels; pixels are square.
+    diagonal_inches
+        Diagonal of the screen in inches.
+    distance_metres
+        From the eye to the screen's centre, in metres.
+
+    Raises
+    ------
+    ValueError
+        Where a number is not positive and finite.
+    """
+    numbers = (*resolution, diagonal_inches, distance_metres)
+    if not all(math.isfinite(number) and number > 0 for number in numbers):
+        raise ValueError(
+            "expected a positive resolution, diagonal (inches) and distance (metres), "
+            f"got {resolution}, {diagonal_inches}, {distance_metres}"
+        )
+    pixel_metres = diagonal_inches * 0.0254 / math.hypot(*resolution)
+    return 2.0 * distance_metres * math.tan(math.radians(0.5)) / pixel_metres

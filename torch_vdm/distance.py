@@ -1,0 +1,60 @@
+"""Distance summation, the last box of Fig. 2: Quick's vector sum over channels and levels."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torch_vdm.quadtree import push
+
+
+def local_visual_difference(difference: Tensor, exponent: Tensor) -> Tensor:
+    """Return the local visual difference of every node (Eq. 5).
+
+    The sum over channels and orientations of abs(P1 - P2)^2.4. Eq. 5 prints no absolute value;
+    a negative base needs one.
+
+    Parameters
+    ----------
+    difference
+        (B, channels, orientations, h, w): pooled absolute differences of the two images.
+    exponent
+        2.4 in the paper.
+
+    Returns
+    -------
+    Tensor
+        (B, 1, h, w), in JND to the power of ``exponent``.
+    """
+    return (difference**exponent).sum((1, 2)).unsqueeze(1)
+
+
+def accumulate(local: Sequence[Tensor], root: Tensor) -> Tensor:
+    """Sum the local differences down every path of the quad-tree.
+
+    Parameters
+    ----------
+    local
+        One (B, 1, h, w) a level, level 0 (the root) first; none for an image of one pixel.
+    root
+        (B, 1, 1, 1), what every path begins with: the lowpass term, or 0.
+
+    Returns
+    -------
+    Tensor
+        (B, 1, h, w) of the finest level, in JND to the power of the summation.
+    """
+    total = root
+    for nodes in local:
+        total = nodes + push(total, (nodes.shape[-2], nodes.shape[-1]))
+    return total
+
+
+def just_noticeable(total: Tensor, exponent: Tensor) -> Tensor:
+    """Return the root of accumulated differences, in JND.
+
+    Its slope at 0, which is infinite, is given as 0: together with the power's own slope, which
+    is 0 there, the derivative by an image is finite everywhere.
+    """
+    differs = total > 0.0
+    return torch.where(differs, torch.where(differs, total, 1.0) ** (1.0 / exponent), 0.0)

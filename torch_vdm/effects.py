@@ -1,0 +1,29 @@
+"""Which effects are simulated."""
+
+from dataclasses import dataclass, fields
+
+
+@dataclass(frozen=True)
+class Effects:
+    """Switches; an effect that is off is not computed.
+
+    Attributes
+    ----------
+    aberration
+        The eye's optics attenuate the S cones' details. Off: factor 1.
+    chromatic
+        The channels C1 and C2. Off: the achromatic channel A alone.
+    masking
+        The transducer. Off: the response is the weighted contrast, 1 at threshold.
+    pooling
+        The 3x3 pooling. Off: every node for itself.
+    """
+
+    aberration: bool = True
+    chromatic: bool = True
+    masking: bool = True
+    pooling: bool = True
+
+    def names(self) -> list[str]:
+        """Return the names of the effects that are on."""
+        return [field.name for field in fields(self) if getattr(self, field.name)]

@@ -1,0 +1,26 @@
+"""The masking transducer, the seventh box of Fig. 2: strong contrast hides contrast."""
+
+import torch
+from torch import Tensor
+
+# Eq. 4 of Bolin and Meyer 1999, T(A) = 2 A^(2.25/2) / (A^(2.05/2) + 1). Status: printed.
+GAIN, NUMERATOR, DENOMINATOR = 2.0, 2.25 / 2.0, 2.05 / 2.0
+
+
+def energy_transducer(energy: Tensor) -> Tensor:
+    """Return T(A) of Eq. 4; A is the energy (contrast x sensitivity)^2, T(1) = 1.
+
+    The sign of a detail is lost in the energy, and the slope at 0 is 0.
+    """
+    return GAIN * energy**NUMERATOR / (energy**DENOMINATOR + 1.0)
+
+
+def signed_transducer(contrast: Tensor, exponent: Tensor) -> Tensor:
+    """Return 2^q v / (1 + v^2)^q for a weighted contrast v (1 at threshold), psi(1) = 1.
+
+    Odd, so that a detail differs from its negative; its slope at 0 is 2^q, so that a loss moves
+    from grey or black; far out it grows as v^(1 - 2q). With q = 0.4 that is Eq. 4's growth,
+    r^0.2. Status: choice.
+    """
+    # Base 2 because a processor's own exponential is: (1 + v^2)^-q = 2^(-q log2(1 + v^2)).
+    return contrast * torch.exp2(exponent * (1.0 - torch.log2(contrast * contrast + 1.0)))

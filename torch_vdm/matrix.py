@@ -1,0 +1,31 @@
+"""A 3x3 matrix applied to the channel axis: Eq. 1, Eq. 3 and the display's primaries."""
+
+import torch
+from torch import Tensor
+
+
+def mix(matrix: Tensor, planes: Tensor) -> Tensor:
+    """Return the three channels of ``planes`` mixed by ``matrix``.
+
+    Written as multiplications and additions: a matrix product would run in bfloat16 under
+    autocast and in TF32 where a user allows it, and its last bits may depend on alignment, so
+    that two equal images would differ.
+
+    Parameters
+    ----------
+    matrix
+        (N, 3); N rows are N output channels.
+    planes
+        (B, 3, ...).
+
+    Returns
+    -------
+    Tensor
+        (B, N, ...).
+    """
+    first, second, third = planes.unbind(1)
+    rows = []
+    for row in matrix:
+        mixed = torch.addcmul(first * row[0], second, row[1])
+        rows.append(torch.addcmul(mixed, third, row[2]))
+    return torch.stack(rows, 1)
