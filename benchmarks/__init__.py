@@ -1,0 +1,1 @@
+"""Figures of speed, memory and accuracy, each from one command: ``python -m benchmarks NAME``."""

@@ -1,0 +1,38 @@
+"""``python -m benchmarks NAME [--quick] [--output DIR]``."""
+
+import argparse
+import importlib
+import sys
+from pathlib import Path
+
+# Imported when asked for: each has its own needs.
+BENCHMARKS = {
+    "speed": "time and memory beside kornia's SSIM; 6 minutes, 1 with --quick",
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks",
+        description="Measure, and write a JSON, a table in Markdown and a plot.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="\n".join(f"  {name}: {what}" for name, what in BENCHMARKS.items()),
+    )
+    parser.add_argument("name", choices=tuple(BENCHMARKS))
+    parser.add_argument("--quick", action="store_true", help="small sizes, few runs: a smoke test")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="where to write; without it, benchmarks/results, and with --quick nothing is written",
+    )
+    options = parser.parse_args()
+    output = options.output
+    if output is None and not options.quick:
+        output = Path(__file__).parent / "results"
+    importlib.import_module(f"benchmarks.{options.name}").run(options.quick, output)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,267 @@
+"""Time and memory of the metric beside kornia's SSIM, in one run.
+
+Times are medians of interleaved runs: every round runs each contender once, so that whatever else
+the machine does strikes all of them. Memory and compile times are those of child processes, which
+begin with nothing. Two threads, sRGB noise in [0, 1], float32.
+"""
+
+import json
+import math
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchmarks.record import caption, circumstances, save
+from torch_vdm import VDM, VDMLoss
+
+THREADS = 2
+FULL_HD = (1080, 1920)
+SIZES = ((512, 512), (1024, 1024), FULL_HD, (2160, 3840))
+QUICK_SIZES = ((128, 128), (192, 256))
+
+Contender = Callable[[Tensor, Tensor], Tensor]
+
+
+def ssim() -> Contender:
+    """Kornia's SSIM map with its window of 11 pixels."""
+    from kornia.metrics import ssim
+
+    return lambda test, reference: ssim(test, reference, 11)
+
+
+def eager() -> Contender:
+    """The default metric."""
+    return VDM()
+
+
+def compiled() -> Contender:
+    """The default metric by its fast route."""
+    return VDM().compile()
+
+
+def paper() -> Contender:
+    """The paper's observer."""
+    return VDM.paper()
+
+
+def ssim_loss() -> Contender:
+    """Kornia's SSIM loss with its window of 11 pixels."""
+    from kornia.losses import SSIMLoss
+
+    loss = SSIMLoss(11)
+    return lambda test, reference: loss(test, reference)
+
+
+def eager_loss() -> Contender:
+    """The default loss."""
+    return VDMLoss()
+
+
+def compiled_loss() -> Contender:
+    """The default loss by its fast route."""
+    loss = VDMLoss()
+    loss.metric.compile()
+    return loss
+
+
+FORWARD = {"kornia SSIM": ssim, "VDM": eager, "VDM compiled": compiled, "VDM paper": paper}
+BACKWARD = {
+    "kornia SSIM loss": ssim_loss,
+    "VDMLoss": eager_loss,
+    "VDMLoss compiled": compiled_loss,
+}
+CONTENDERS = FORWARD | BACKWARD
+COMPILED = ("VDM compiled", "VDMLoss compiled")
+
+
+def run(quick: bool, output: Path | None) -> None:
+    """Measure, print the table, and write speed.json, speed.md and speed.png to ``output``."""
+    torch.set_num_threads(THREADS)
+    sizes = QUICK_SIZES if quick else SIZES
+    size = sizes[-1] if quick else FULL_HD
+    rounds = 2 if quick else 9
+    result: dict[str, Any] = {**circumstances(), "size": size, "rounds": rounds}
+    result["forward_seconds"] = _interleaved(FORWARD, size, rounds)
+    result["backward_seconds"] = _interleaved(BACKWARD, size, rounds)
+    result["forward_seconds_by_size"] = {
+        f"{width}x{height}": _interleaved(
+            {name: FORWARD[name] for name in ("VDM", "VDM compiled")}, (height, width), rounds
+        )
+        for height, width in sizes
+    }
+    # A compiled contender costs a smoke test half a minute in each child.
+    measured = [name for name in CONTENDERS if not (quick and name in COMPILED)]
+    result["peak_extra_megabytes"] = {
+        name: _child("memory", name, size)["megabytes"] for name in measured
+    }
+    result["compile_seconds"] = _compile_times(size, COMPILED[:1] if quick else COMPILED)
+    table = _table(result)
+    print(table)
+    if output is not None:
+        save(output, "speed", result, table)
+        _plot(result, output / "speed.png")
+
+
+def _images(size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    reference = torch.rand(1, 3, *size, generator=generator)
+    noise = 0.05 * torch.randn(reference.shape, generator=generator)
+    return (reference + noise).clamp(0.0, 1.0), reference
+
+
+def _once(name: str, contender: Contender, test: Tensor, reference: Tensor) -> None:
+    if name in FORWARD:
+        with torch.no_grad():
+            contender(test, reference)
+    else:
+        contender(test.clone().requires_grad_(), reference).backward()
+
+
+def _interleaved(
+    makers: dict[str, Callable[[], Contender]], size: tuple[int, int], rounds: int
+) -> dict[str, float]:
+    """Return each contender's median seconds, in interleaved runs."""
+    test, reference = _images(size)
+    contenders = {name: maker() for name, maker in makers.items()}
+    seconds: dict[str, list[float]] = {name: [] for name in contenders}
+    for number in range(rounds + 2):
+        for name, contender in contenders.items():
+            start = time.perf_counter()
+            _once(name, contender, test, reference)
+            if number >= 2:  # the first rounds compile and fill caches
+                seconds[name].append(time.perf_counter() - start)
+    return {name: statistics.median(values) for name, values in seconds.items()}
+
+
+def _compile_times(
+    size: tuple[int, int], names: tuple[str, ...]
+) -> dict[str, dict[str, float]]:
+    """Return the seconds of the first compiled calls in a new process, cold and from the cache."""
+    times: dict[str, dict[str, float]] = {}
+    for name in names:
+        with tempfile.TemporaryDirectory() as cache:
+            environment = {"TORCHINDUCTOR_CACHE_DIR": cache}
+            times[name] = {
+                state: _child("first", name, size, environment)["seconds"]
+                for state in ("cold", "from the cache")
+            }
+    return times
+
+
+def _child(
+    what: str, name: str, size: tuple[int, int], environment: dict[str, str] | None = None
+) -> dict[str, float]:
+    """Measure ``what`` in a process of its own."""
+    command = [sys.executable, "-m", "benchmarks.speed", what, name, *map(str, size)]
+    done = subprocess.run(
+        command,
+        env=os.environ | (environment or {}),
+        cwd=Path(__file__).parent.parent,
+        stdout=subprocess.PIPE,
+        check=True,
+    )
+    figures: dict[str, float] = json.loads(done.stdout)
+    return figures
+
+
+def _measure(what: str, name: str, size: tuple[int, int]) -> dict[str, float]:
+    """Return the seconds of a first call, or its peak of memory over what stood before."""
+    torch.set_num_threads(THREADS)
+    contender = CONTENDERS[name]()
+    test, reference = _images(size)
+    if what == "first":
+        start = time.perf_counter()
+        _once(name, contender, test, reference)
+        return {"seconds": time.perf_counter() - start}
+    # Imports, thread pools and compilation are not the metric's working memory.
+    _once(name, contender, *_images((96, 160)))
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak
+    before = _status("VmRSS")
+    _once(name, contender, test, reference)
+    return {"megabytes": (_status("VmHWM") - before) / 1e3}
+
+
+def _status(field: str) -> float:
+    """Return a field of /proc/self/status in kilobytes."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(field):
+            return float(line.split()[1]) * 1.024
+    raise RuntimeError(f"no {field} in /proc/self/status: memory is measured on Linux only")
+
+
+def _table(result: dict[str, Any]) -> str:
+    height, width = result["size"]
+    lines = [
+        f"# Speed and memory, {width} x {height}",
+        "",
+        caption(result),
+        "",
+        "| | seconds | to kornia | peak extra MB |",
+        "|---|---|---|---|",
+    ]
+    for key, yardstick in (
+        ("forward_seconds", "kornia SSIM"),
+        ("backward_seconds", "kornia SSIM loss"),
+    ):
+        for name, seconds in result[key].items():
+            ratio = seconds / result[key][yardstick]
+            memory = result["peak_extra_megabytes"].get(name, math.nan)
+            lines.append(f"| {name} | {seconds:.3f} | {ratio:.2f} | {memory:.0f} |")
+    lines += ["", "The lower three: forward and backward.", ""]
+    lines += ["| size | VDM, ns a pixel | VDM compiled, ns a pixel |", "|---|---|---|"]
+    for size, seconds in result["forward_seconds_by_size"].items():
+        wide, high = map(int, size.split("x"))
+        cells = " | ".join(f"{1e9 * value / (wide * high):.0f}" for value in seconds.values())
+        lines.append(f"| {size} | {cells} |")
+    lines += ["", "| first call | cold, s | from the cache, s |", "|---|---|---|"]
+    for name, states in result["compile_seconds"].items():
+        lines.append(f"| {name} | {states['cold']:.1f} | {states['from the cache']:.1f} |")
+    return "\n".join(lines) + "\n"
+
+
+def _plot(result: dict[str, Any], path: Path) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 3.6), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    bars, curve = figure.subplots(1, 2)
+    ratios = {
+        name: seconds / result["forward_seconds"]["kornia SSIM"]
+        for name, seconds in result["forward_seconds"].items()
+    }
+    shown = bars.barh(list(ratios), list(ratios.values()), color="#3b5b92")
+    bars.bar_label(shown, fmt="%.2f", padding=3)
+    bars.set_xlim(0.0, 1.25 * max(ratios.values()))
+    bars.invert_yaxis()
+    bars.set_xlabel("time, kornia's SSIM = 1")
+    height, width = result["size"]
+    bars.set_title(f"forward, {width} x {height}", fontsize=10)
+    for name in ("VDM", "VDM compiled"):
+        points = []
+        for size, seconds in result["forward_seconds_by_size"].items():
+            wide, high = map(int, size.split("x"))
+            points.append((wide * high / 1e6, 1e9 * seconds[name] / (wide * high)))
+        curve.plot(*zip(*points, strict=True), marker="o", label=name)
+    curve.set_xscale("log")
+    curve.set_ylim(bottom=0.0)
+    curve.set_xlabel("megapixels")
+    curve.set_ylabel("nanoseconds a pixel")
+    curve.set_title("time against size", fontsize=10)
+    curve.legend(frameon=False, fontsize=9)
+    for axis in (bars, curve):
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path)
+
+
+if __name__ == "__main__":
+    print(json.dumps(_measure(sys.argv[1], sys.argv[2], (int(sys.argv[3]), int(sys.argv[4])))))

@@ -1,0 +1,44 @@
+"""Eq. 5 and the sums down the tree against the reference."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.reference import paper
+from torch_vdm.distance import accumulate, just_noticeable, local_visual_difference
+from torch_vdm.quadtree import push
+
+EXPONENT = torch.tensor(2.4, dtype=torch.float64)
+
+
+def test_eq_5_is_the_reference() -> None:
+    difference = np.random.default_rng(1).normal(size=(3, 3, 5, 6))
+    expected = paper.local_visual_difference(difference)
+    actual = local_visual_difference(torch.from_numpy(difference).abs()[None], EXPONENT)
+    np.testing.assert_allclose(actual[0, 0].numpy(), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("size", [(2, 2), (1, 5), (9, 6), (16, 16)])
+def test_sums_down_the_paths_are_the_references(size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(2)
+    sizes = [size]
+    while max(sizes[0]) > 1:
+        sizes.insert(0, (-(-sizes[0][0] // 2), -(-sizes[0][1] // 2)))
+    local = tuple(rng.uniform(size=nodes) for nodes in sizes[:-1])
+    expected = paper.sum_down_paths(local, *size)
+    zero = torch.zeros(1, 1, 1, 1, dtype=torch.float64)
+    actual = push(accumulate([torch.from_numpy(nodes)[None, None] for nodes in local], zero), size)
+    np.testing.assert_allclose(actual[0, 0].numpy(), expected, rtol=1e-12)
+
+
+def test_the_root_term_reaches_every_leaf() -> None:
+    local = [torch.zeros(1, 1, 1, 2), torch.zeros(1, 1, 2, 4)]
+    assert (accumulate(local, torch.full((1, 1, 1, 1), 3.0)) == 3.0).all()
+
+
+def test_the_root_undoes_the_power_and_has_a_finite_slope_at_zero() -> None:
+    jnd = torch.tensor([0.0, 1e-6, 1.0, 30.0], dtype=torch.float64, requires_grad=True)
+    back = just_noticeable(jnd**EXPONENT, EXPONENT)
+    torch.testing.assert_close(back, jnd)
+    (gradient,) = torch.autograd.grad(back.sum(), jnd)
+    torch.testing.assert_close(gradient, torch.tensor([0.0, 1.0, 1.0, 1.0], dtype=torch.float64))
