@@ -221,7 +221,7 @@ def test_effects_that_are_off_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> N
     def forbidden(*_: object) -> None:
         pytest.fail("an effect that is off was computed")
 
-    for name in ("short_wave_attenuation", "butterworth", "signed_transducer", "pool"):
+    for name in ("attenuation", "butterworth", "signed_transducer", "surround"):
         monkeypatch.setattr(f"torch_vdm.vdm.{name}", forbidden)
     VDM(effects=Effects(False, False, False, False))(*images())
 

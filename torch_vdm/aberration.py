@@ -4,17 +4,12 @@ import torch
 from torch import Tensor
 
 
-def short_wave_attenuation(frequency: Tensor, cutoff: Tensor, exponent: Tensor) -> Tensor:
-    """Return the share of the S cones' contrast that the eye's optics let through.
+def attenuation(frequency: Tensor, cutoff: Tensor, exponent: Tensor) -> Tensor:
+    """Return the share of each cone's contrast, S, M, L, that the eye's optics let through.
 
-    exp(-(f / cutoff)^exponent), between 0 and 1: the ratio of the S cones' to the luminance
-    modulation transfer (Section 2, after Marimont and Wandell 1993). ``frequency`` and
-    ``cutoff`` are in cycles/degree.
+    exp(-(f / cutoff)^exponent) for S, between 0 and 1: the ratio of the S cones' to the luminance
+    modulation transfer (Section 2, after Marimont and Wandell 1993); 1 for M and L.
+    ``frequency`` and ``cutoff`` are 0-dim, in cycles/degree; the result is (3,).
     """
-    return torch.exp(-((frequency / cutoff) ** exponent))
-
-
-def attenuate_short_wave(details: Tensor, attenuation: Tensor) -> Tensor:
-    """Scale the S cones' details (B, 3, orientations, h, w) by a 0-dim ``attenuation``."""
-    one = torch.ones_like(attenuation)
-    return details * torch.stack((attenuation, one, one)).view(3, 1, 1, 1)
+    short = torch.exp(-((frequency / cutoff) ** exponent))
+    return torch.stack((short, torch.ones_like(short), torch.ones_like(short)))

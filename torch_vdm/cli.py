@@ -220,7 +220,7 @@ def _viewing(options: argparse.Namespace) -> tuple[float, str]:
         )
     if options.ppd is not None:
         return options.ppd, f"{options.ppd:g} pixels per degree (--ppd)"
-    return PPD, f"{PPD:g} pixels per degree (assumed; --ppd)"
+    return PPD, f"{PPD:g} pixels per degree, for nothing was given (--ppd)"
 
 
 def _load_pair(reference: Path, test: Path, options: argparse.Namespace) -> _Pair:

@@ -23,14 +23,14 @@ def adapted(lowpass: Tensor, dark_light: Tensor) -> Tensor:
     return lowpass.clamp_min(0.0) + dark_light.view(3, 1, 1)
 
 
-def local_contrast(details: Tensor, adaptation: Tensor) -> Tensor:
+def local_contrast(details: Tensor, scale: Tensor) -> Tensor:
     """Divide the details by the adapted lowpass one level up (Section 2, "local contrast").
 
     Parameters
     ----------
     details
         (B, 3, orientations, h, w); cones S, M, L.
-    adaptation
+    scale
         (B, 3, h, w): one over what `adapted` gives for the parent of each node. Not for the
         nodes themselves: a contrast is at most 4 for light that is not negative.
 
@@ -39,7 +39,7 @@ def local_contrast(details: Tensor, adaptation: Tensor) -> Tensor:
     Tensor
         (B, 3, orientations, h, w), cone contrast without unit.
     """
-    return details * adaptation.unsqueeze(2)
+    return details * scale.unsqueeze(2)
 
 
 def weber_contrast(first: Tensor, second: Tensor, dark_light: Tensor) -> Tensor:

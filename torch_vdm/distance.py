@@ -17,7 +17,7 @@ def local_visual_difference(difference: Tensor, exponent: Tensor) -> Tensor:
     Parameters
     ----------
     difference
-        (B, channels, orientations, h, w): pooled absolute differences of the two images.
+        (B, channels, orientations, h, w): what is left of the two images' pooled responses.
     exponent
         2.4 in the paper.
 
@@ -26,7 +26,7 @@ def local_visual_difference(difference: Tensor, exponent: Tensor) -> Tensor:
     Tensor
         (B, 1, h, w), in JND to the power of ``exponent``.
     """
-    return (difference**exponent).sum((1, 2)).unsqueeze(1)
+    return (difference.abs() ** exponent).sum((1, 2)).unsqueeze(1)
 
 
 def accumulate(local: Sequence[Tensor], root: Tensor) -> Tensor:

@@ -39,8 +39,8 @@ class Observer:
         Sensitivity of A, C1, C2 to the Weber contrast between the two images' coarsest lowpass;
         None: never compared, as printed.
     score_exponent, score_coefficients
-        The detection score: exponent of its Minkowski sum, and the number of coefficients at
-        threshold that together score 1 JND.
+        The detection score: exponent of its Minkowski sum, and the number of coefficients with
+        a response of 1 that together score 1 JND.
     """
 
     name: str
@@ -95,7 +95,7 @@ class Observer:
             summation_exponent=2.4,  # printed: Eq. 5
             lowpass_gains=None,  # printed: never compared
             score_exponent=4.0,
-            score_coefficients=1.0,
+            score_coefficients=150.0,  # fitted: the median achromatic threshold scores 1
         )
 
     @classmethod
@@ -123,7 +123,7 @@ class Observer:
             summation_exponent=2.4,  # source: Eq. 5
             lowpass_gains=(20.0, 76.0, 36.0),  # choice: a Weber contrast of 5 % is 1 JND
             score_exponent=4.0,
-            score_coefficients=1.0,
+            score_coefficients=150.0,  # fitted: the median achromatic threshold scores 1
         )
 
     def numbers(self) -> dict[str, float]:

@@ -6,8 +6,9 @@ from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
+from torch.fx.experimental import _config as fx_config
 
-from torch_vdm.aberration import attenuate_short_wave, short_wave_attenuation
+from torch_vdm.aberration import attenuation
 from torch_vdm.cones import XYZ_TO_SML, cone_responses
 from torch_vdm.contrast import (
     SML_TO_OPPONENTS,
@@ -24,7 +25,7 @@ from torch_vdm.effects import Effects
 from torch_vdm.masking import energy_transducer, signed_transducer
 from torch_vdm.matrix import mix
 from torch_vdm.observer import Observer
-from torch_vdm.pooling import pool
+from torch_vdm.pooling import pool, surround
 from torch_vdm.quadtree import push
 
 Nonfinite = Literal["raise", "mask"]
@@ -35,6 +36,9 @@ DEEPEST = 24
 # Levels with fewer coefficients stay uncompiled: a compiled call costs more than they do.
 # Status: choice.
 SMALLEST_COMPILED = 4096
+
+# Planes with more numbers are computed in parts. Status: choice, measured.
+LARGEST_AT_ONCE = 2**20
 
 
 class Level(NamedTuple):
@@ -206,26 +210,21 @@ class VDM(nn.Module):
         return just_noticeable(total / constants["score_coefficients"], exponent)
 
     def represent(self, image: Tensor) -> Cortex:
-        """Return the cortex representation of an image: cones, Haar, chromatic aberration.
+        """Return the cortex representation of an image: display, cones, transform.
 
         ``image`` is (B, 3, H, W) in float32 or float64, as the display expects it.
         """
         constants = self._constants(image.dtype)
-        light = _compiled(_light) if self._fast else _light
-        planes = light(image, self.display, constants["primaries"], constants["cones"])
-        cortex = self.transform.decompose(planes)
-        if not self.effects.aberration:
-            return cortex
-        details = []
-        for level, detail in zip(self._levels(cortex, constants), cortex.details, strict=True):
-            attenuation = short_wave_attenuation(
-                level.frequency, constants["aberration_cutoff"], constants["aberration_exponent"]
-            )
-            details.append(attenuate_short_wave(detail, attenuation))
-        return cortex._replace(details=tuple(details))
+        around = self.display, constants["primaries"], constants["cones"]
+        if self._fast:
+            planes = _compiled(_light)(image, *around)
+        else:
+            rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
+            planes = torch.cat([_light(part, *around) for part in image.split(rows, -2)], -2)
+        return self.transform.decompose(planes)
 
     def respond(self, cortex: Cortex) -> tuple[Tensor, ...]:
-        """Return the responses of one image: local contrast to the transducer.
+        """Return the responses of one image: chromatic aberration to the transducer.
 
         One (B, channels, orientations, h, w) a level, level 0 first; 1 is threshold.
         """
@@ -265,43 +264,66 @@ class VDM(nn.Module):
         level at a time, which bounds memory.
         """
         constants = self._constants(first.lowpass[0].dtype)
+        root = self.lowpass_difference(first, second) ** constants["summation_exponent"]
+        local = [
+            self._local_difference(first, second, number, level, constants)
+            for number, level in enumerate(self._levels(first, constants))
+        ]
+        return accumulate(local, root.sum(1, keepdim=True))
+
+    def _local_difference(
+        self,
+        first: Cortex,
+        second: Cortex,
+        number: int,
+        level: Level,
+        constants: dict[str, Tensor],
+    ) -> Tensor:
+        """Return the local visual difference (B, 1, h, w) of one level."""
+        details = first.details[number], second.details[number]
+        around = (
+            *self._sight(first, number, level, constants),
+            *self._sight(second, number, level, constants),
+            constants["opponents"],
+            constants["transducer_exponent"],
+            self.observer.signed,
+            self.effects.masking,
+        )
         exponent = constants["summation_exponent"]
-        root = (self.lowpass_difference(first, second) ** exponent).sum(1, keepdim=True)
-        local = []
-        for number, level in enumerate(self._levels(first, constants)):
-            details = first.details[number]
-            planes = (
-                details,
-                second.details[number],
-                *self._sight(first, number, level, constants),
-                *self._sight(second, number, level, constants),
-            )
-            settings = (
-                constants["opponents"],
-                constants["transducer_exponent"],
-                self.observer.signed,
-                self.effects.masking,
-            )
-            fast = self._fast and details.numel() >= SMALLEST_COMPILED
-            compare = _compiled(_response_difference) if fast else _response_difference
-            difference = compare(*planes, *settings)
-            # Printed responses are pooled as a difference, for pooling is linear; signed ones as
-            # an absolute difference, for neighbours alternate and would cancel.
-            pooled = pool(difference) if self.effects.pooling else difference
-            local.append(local_visual_difference(pooled.abs(), exponent))
-        return accumulate(local, root)
+        if self._fast and details[0].numel() >= SMALLEST_COMPILED:
+            difference = _compiled(_response_difference)(*details, *around)
+            if self.effects.pooling:
+                return _compiled(_pooled_difference)(surround(difference), exponent)
+            return local_visual_difference(difference, exponent)
+        # One orientation at a time where the planes are large: what is computed on the way then
+        # stays in the processor's cache.
+        step = 1 if details[0].numel() > LARGEST_AT_ONCE else details[0].shape[2]
+        local: list[Tensor] = []
+        for parts in zip(*(detail.split(step, 2) for detail in details), strict=True):
+            difference = _response_difference(*parts, *around)
+            if self.effects.pooling:
+                local.append(_pooled_difference(surround(difference), exponent))
+            else:
+                local.append(local_visual_difference(difference, exponent))
+        return torch.stack(local).sum(0) if len(local) > 1 else local[0]
 
     def _sight(
         self, cortex: Cortex, number: int, level: Level, constants: dict[str, Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """Return what the parents of a level's nodes set for them.
+        """Return what turns a level's details into contrasts and weights them.
 
-        One over the adaptation of each cone, (B, 3, h, w), and the contrast sensitivity of each
-        channel, (B, channels, h, w), or 1 x 1 nodes of it where it is everywhere the same.
+        For each cone (B, 3, h, w): the share that chromatic aberration leaves, over the parent's
+        adaptation; scaled at the parents, of which there are fewer. For each channel the contrast
+        sensitivity, (B, channels, h, w), or one node of it where it is everywhere the same.
         """
         parent = cortex.parent_lowpass(number)
         size = (cortex.details[number].shape[-2], cortex.details[number].shape[-1])
-        adaptation = push(adapted(parent, constants["dark_cones"]).reciprocal(), size)
+        scale = adapted(parent, constants["dark_cones"]).reciprocal()
+        if self.effects.aberration:
+            passed = attenuation(
+                level.frequency, constants["aberration_cutoff"], constants["aberration_exponent"]
+            )
+            scale = scale * passed.view(3, 1, 1)
         if self.observer.adaptation_luminance is None:
             seen = mix(constants["luminance_of_cones"], parent).clamp_min(0.0)
             luminance = seen + constants["dark_light"]
@@ -309,7 +331,7 @@ class VDM(nn.Module):
         else:
             luminance = constants["adaptation_luminance"].view(1, 1, 1, 1)
             sensitivity = _sensitivity(luminance, level, constants, self.effects)
-        return adaptation, sensitivity
+        return push(scale, size), sensitivity
 
     def _levels(self, cortex: Cortex, constants: dict[str, Tensor]) -> list[Level]:
         """Return what each level of ``cortex`` responds to, level 0 (the coarsest) first."""
@@ -368,7 +390,7 @@ def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) ->
 
 def _response(
     details: Tensor,
-    adaptation: Tensor,
+    scale: Tensor,
     sensitivity: Tensor,
     matrix: Tensor,
     exponent: Tensor,
@@ -376,7 +398,7 @@ def _response(
     masking: bool,
 ) -> Tensor:
     """Return the responses of one level of one image: local contrast to the transducer."""
-    contrast = opponents(local_contrast(details, adaptation), matrix)
+    contrast = opponents(local_contrast(details, scale), matrix)
     weighted = contrast * sensitivity.unsqueeze(2)
     if signed:
         return signed_transducer(weighted, exponent) if masking else weighted
@@ -386,9 +408,9 @@ def _response(
 def _response_difference(
     details: Tensor,
     other_details: Tensor,
-    adaptation: Tensor,
+    scale: Tensor,
     sensitivity: Tensor,
-    other_adaptation: Tensor,
+    other_scale: Tensor,
     other_sensitivity: Tensor,
     matrix: Tensor,
     exponent: Tensor,
@@ -400,9 +422,9 @@ def _response_difference(
     Each image by itself: equal images then take equal paths through the vectorised loops, and
     their difference is exactly 0.
     """
-    response = _response(details, adaptation, sensitivity, matrix, exponent, signed, masking)
+    response = _response(details, scale, sensitivity, matrix, exponent, signed, masking)
     other = _response(
-        other_details, other_adaptation, other_sensitivity, matrix, exponent, signed, masking
+        other_details, other_scale, other_sensitivity, matrix, exponent, signed, masking
     )
     return (response - other).abs() if signed else response - other
 
@@ -429,10 +451,27 @@ def _sensitivity(
     return torch.cat(channels, 1) / level.gain
 
 
+def _pooled_difference(surrounded: Tensor, exponent: Tensor) -> Tensor:
+    """Return the local visual difference of response differences, pooled.
+
+    Printed responses are pooled as a difference, for pooling is linear; signed ones come as an
+    absolute difference, for neighbours alternate and would cancel.
+    """
+    return local_visual_difference(pool(surrounded), exponent)
+
+
 @cache
 def _compiled(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """Return the compiled form of a function of planes, for every size."""
-    return torch.compile(function, dynamic=True, fullgraph=True)
+    compiled = torch.compile(function, dynamic=True, fullgraph=True)
+
+    def call(*arguments: object) -> Tensor:
+        # Without this, two sides that are equal in the first image are taken to be equal always,
+        # and the first image that is not square compiles everything again.
+        with fx_config.patch(use_duck_shape=False):
+            return compiled(*arguments)
+
+    return call
 
 
 def _items(batch: Tensor) -> Iterator[Tensor]:

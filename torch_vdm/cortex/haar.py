@@ -40,7 +40,7 @@ def _analyse(planes: Tensor) -> tuple[Tensor, Tensor]:
     """Return the lowpass (B, C, h/2, w/2) and the details (B, C, 3, h/2, w/2) of a plane, Eq. 2."""
     even = pad_even(planes)
     top, bottom = even[..., 0::2, :], even[..., 1::2, :]
-    sums, differences = 0.25 * (top + bottom), 0.25 * (top - bottom)
+    sums, differences = (top + bottom).mul_(0.25), (top - bottom).mul_(0.25)
     left, right = sums[..., 0::2], sums[..., 1::2]
     upper, lower = differences[..., 0::2], differences[..., 1::2]
     return left + right, torch.stack((left - right, upper + lower, upper - lower), 2)

@@ -1,0 +1,56 @@
+"""What is told of a map."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from torch_vdm.display import decode_srgb
+from torch_vdm.report import Comparison, encode_srgb, figures, write_heat_map
+
+
+def comparison(**changes: object) -> Comparison:
+    values: dict[str, object] = {
+        "max_jnd": 3.2, "max_pixel": (4, 5), "mean_jnd": 1.0, "p95_jnd": 2.0,
+        "visible_fraction": 0.25, "score_jnd": 5.0, "mean_luminance_change": 0.0, "width": 8,
+        "height": 9, "ppd": 60.0, "accuracy": "fast", "observer": "calibrated", "effects": [],
+        "seconds": 0.1, "assumptions": [], "version": "0", "reproduce": "",
+    }  # fmt: skip
+    return Comparison(**values | changes)  # type: ignore[arg-type]  # a dictionary for brevity
+
+
+def test_figures_are_those_of_numpy() -> None:
+    jnd = torch.rand(20, 31, generator=torch.Generator().manual_seed(1)) * 3.0
+    values = jnd.numpy()
+    told = figures(jnd)
+    x, y = told["max_pixel"]
+    assert values[y, x] == values.max()
+    assert told["max_jnd"] == values.max()
+    assert told["mean_jnd"] == pytest.approx(values.mean(dtype=np.float64))
+    assert told["p95_jnd"] == np.quantile(values, 0.95, method="inverted_cdf")
+    assert told["visible_fraction"] == (values > 1.0).mean()
+
+
+def test_verdicts() -> None:
+    assert "up to 3.2 JND (at x 4, y 5), in 25.0% of the image" in comparison().verdict()
+    assert "under 0.1%" in comparison(visible_fraction=1e-4).verdict()
+    invisible = comparison(max_jnd=0.9, visible_fraction=0.0).verdict()
+    assert invisible.startswith("Nobody will see a difference at 60 pixels per degree")
+
+
+def test_encoding_undoes_decoding() -> None:
+    coded = torch.linspace(0.0, 1.0, 256, dtype=torch.float64)
+    # The standard's two rounded ends of the linear part differ by 3e-8.
+    torch.testing.assert_close(encode_srgb(decode_srgb(coded)), coded, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (64, 40), (30, 300)])
+def test_heat_map_is_a_picture(size: tuple[int, int], tmp_path: Path) -> None:
+    image = torch.rand(3, *size)
+    path = tmp_path / "map.png"
+    write_heat_map(path, image, image, torch.rand(size), "a title")
+    with Image.open(path) as picture:
+        assert min(picture.size) > 100
+    assert list(tmp_path.iterdir()) == [path]
