@@ -142,9 +142,7 @@ def _interleaved(
     return {name: statistics.median(values) for name, values in seconds.items()}
 
 
-def _compile_times(
-    size: tuple[int, int], names: tuple[str, ...]
-) -> dict[str, dict[str, float]]:
+def _compile_times(size: tuple[int, int], names: tuple[str, ...]) -> dict[str, dict[str, float]]:
     """Return the seconds of the first compiled calls in a new process, cold and from the cache."""
     times: dict[str, dict[str, float]] = {}
     for name in names:

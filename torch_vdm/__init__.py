@@ -3,6 +3,7 @@
 from torch_vdm.cortex import Haar
 from torch_vdm.display import Display, pixels_per_degree
 from torch_vdm.effects import Effects
+from torch_vdm.io import ImageError, read_image, write_image
 from torch_vdm.loss import VDMLoss
 from torch_vdm.observer import Observer
 from torch_vdm.vdm import VDM
@@ -14,7 +15,10 @@ __all__ = [
     "Display",
     "Effects",
     "Haar",
+    "ImageError",
     "Observer",
     "VDMLoss",
     "pixels_per_degree",
+    "read_image",
+    "write_image",
 ]
