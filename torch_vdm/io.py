@@ -232,26 +232,29 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         refuses to write.
     """
     target = Path(os.path.realpath(path))
-    if not target.parent.is_dir():
-        raise ImageError(f"{os.fspath(path)}: expected the folder to exist; create it first")
-    # Renaming over a folder fails, and over a device such as /dev/null replaces the device.
-    if target.exists() and not target.is_file():
-        raise ImageError(
-            f"{os.fspath(path)}: expected a file to write to, got a folder or a device"
-        )
     # Not tempfile.mkstemp: its files can be read by their owner only, and so would the result.
     temporary = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
+    ours = {str(name) for name in (None, temporary, target, target.parent)}
     try:
+        _check_target(target)
         yield temporary
         temporary.replace(target)
     except OSError as error:
-        if error.filename not in (None, temporary, str(temporary)):
+        if str(error.filename) not in ours:
             raise
         raise ImageError(
             f"{os.fspath(path)}: cannot be written: {error.strerror or error}"
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _check_target(target: Path) -> None:
+    if not target.parent.is_dir():
+        raise ImageError(f"{target}: expected the folder to exist; create it first")
+    # Renaming over a folder fails, and over a device such as /dev/null replaces the device.
+    if target.exists() and not target.is_file():
+        raise ImageError(f"{target}: expected a file to write to, got a folder or a device")
 
 
 def _load(
@@ -434,12 +437,10 @@ def _load_png(data: bytes, notes: list[str]) -> Floats:
             _note_profile(image.info, notes)
             alpha = bool(kind & 4) or "transparency" in image.info
             image.info.pop("transparency", None)  # else convert() below warns about palettes
-            if depth == 16 and kind in (2, 6):
-                # Pillow keeps 8 of the 16 bits of a colour image.
-                mode = "rgb" if kind == 2 else "rgba"
+            mode = {0: "mono", 2: "rgb", 6: "rgba"}.get(kind)
+            if depth == 16 and mode:
+                # Pillow keeps 8 of the 16 bits of a colour image; kornia_rs has no grey with alpha.
                 values = decode_image_png_u16(data, (height, width), mode)[..., :3]
-            elif image.mode.startswith("I"):
-                values = np.asarray(image)[..., None]
             else:
                 values = np.asarray(image.convert("RGB"))
     except Exception as error:
@@ -448,8 +449,8 @@ def _load_png(data: bytes, notes: list[str]) -> Floats:
     if kind in (0, 4):
         notes.append("The image is grey: R = G = B.")
     if depth == 16:
-        kept = "16" if values.dtype == np.uint16 else "of which 8 are kept"
-        notes.append(f"The channels have 16 bits{'' if kept == '16' else ', ' + kept}.")
+        lost = "" if values.dtype == np.uint16 else ", of which 8 are kept"
+        notes.append(f"The channels have 16 bits{lost}.")
     if alpha:
         notes.append("The transparency is left out: colours are taken as they stand in the file.")
     return _unit_planes(values)
@@ -556,8 +557,13 @@ _MODELS = (("R", "G", "B"), ("Y", "RY", "BY"), ("X", "Y", "Z"), ("Y",))
 
 @dataclass(frozen=True)
 class _Channel:
-    bytes: int  # a sample
+    kind: int  # 0 unsigned integer, 1 half, 2 float
     step: tuple[int, int]  # one sample every so many pixels in x, in y
+
+    @property
+    def bytes(self) -> int:
+        """The size of a sample."""
+        return 2 if self.kind == 1 else 4
 
 
 @dataclass(frozen=True)
@@ -666,7 +672,7 @@ def _part(attributes: dict[str, bytes], flags: int) -> _Part:
             raise _damaged("its channels are not in alphabetical order")
         if pixel_type not in (0, 1, 2) or x_step < 1 or y_step < 1:
             raise _damaged(f"channel {_short(name)!r} has an unknown type or sampling")
-        channels[name] = _Channel(2 if pixel_type == 1 else 4, (x_step, y_step))
+        channels[name] = _Channel(pixel_type, (x_step, y_step))
         last, at = data[at : end - 1], end + 16
     windows = [_value(attributes, name, "<iiii") for name in ("dataWindow", "displayWindow")]
     for x0, y0, x1, y1 in windows:
@@ -735,7 +741,9 @@ def _choose(
     if len(parts) > 1:
         notes.append(f"Of {len(parts)} parts, part {index} ({_short(part.name)!r}) is read.")
     if "." in names[0]:
-        notes.append(f"The channels {_listed(list(names))} are taken as R, G, B.")
+        notes.append(f"The image is read from the channels {_listed(list(names))}.")
+    if any(part.channels[name].kind == 0 for name in names):
+        notes.append("The channels hold whole numbers, which are taken as they are.")
     others = [name for name in part.channels if name not in names]
     if others:
         notes.append(f"Channels that are not used: {_listed(others)}.")
@@ -782,7 +790,9 @@ def _check(part: _Part, size: int) -> None:
         _check_size(columns, rows, columns * rows * 4 * len(part.channels), size)
 
 
-def _blocks(data: bytes, part: _Part, table: int, index: int | None) -> list[tuple[bytes, bytes]]:
+def _blocks(
+    data: bytes, part: _Part, table: int, index: int | None
+) -> list[tuple[bytes, memoryview]]:
     """Every block of the full-resolution image: where it stands in it, and its compressed data.
 
     `table` is where the part's table of offsets begins, `index` the number of the part in a file
@@ -810,6 +820,7 @@ def _blocks(data: bytes, part: _Part, table: int, index: int | None) -> list[tup
         )
     offsets = struct.unpack_from(f"<{len(places)}Q", data, table)
     blocks = []
+    view = memoryview(data)  # a slice of it is no copy
     missing = 0
     for offset, place, new_place in zip(offsets, places, moved, strict=True):
         leader = place if index is None else struct.pack("<i", index) + place
@@ -825,7 +836,7 @@ def _blocks(data: bytes, part: _Part, table: int, index: int | None) -> list[tup
         if begin + size > len(data):
             missing += 1
             continue
-        blocks.append((new_place, data[begin : begin + size]))
+        blocks.append((new_place, view[begin : begin + size]))
     if missing:
         raise ImageError(
             f"incomplete: {missing} of {len(places)} blocks of pixels are missing or cut off; "
@@ -834,7 +845,7 @@ def _blocks(data: bytes, part: _Part, table: int, index: int | None) -> list[tup
     return blocks
 
 
-def _one_part(part: _Part, blocks: list[tuple[bytes, bytes]], long_names: bool) -> bytes:
+def _one_part(part: _Part, blocks: list[tuple[bytes, memoryview]], long_names: bool) -> bytes:
     """An OpenEXR file of this part alone, its data window moved to the origin."""
     width, height = part.size
     window = struct.pack("<iiii", 0, 0, width - 1, height - 1)
@@ -857,12 +868,13 @@ def _one_part(part: _Part, blocks: list[tuple[bytes, bytes]], long_names: bool) 
         head += f"{name}\0{kind}\0".encode() + struct.pack("<i", len(value)) + value
     head += b"\0"
     at = len(head) + 8 * len(blocks)
-    offsets = []
+    offsets: list[int] = []
+    body: list[bytes | memoryview] = []
     for place, block in blocks:
         offsets.append(at)
+        body += [place, struct.pack("<i", len(block)), block]
         at += len(place) + 4 + len(block)
-    body = b"".join(place + struct.pack("<i", len(block)) + block for place, block in blocks)
-    return head + struct.pack(f"<{len(offsets)}Q", *offsets) + body
+    return b"".join([head, struct.pack(f"<{len(offsets)}Q", *offsets), *body])
 
 
 def _decoded(data: bytes, names: tuple[str, ...]) -> list[Floats]:
@@ -883,8 +895,9 @@ def _decoded(data: bytes, names: tuple[str, ...]) -> list[Floats]:
 BT709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 # The "primaries" of a file whose R, G, B are CIE X, Y, Z; its white is a formality.
 XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
-# Differences below this are rounding in the file, not other primaries (choice).
-SAME_CHROMATICITY = 1e-3
+# Chromaticities, or coefficients of a conversion, that differ by less are the same but for rounding
+# in the file (choice).
+SAME_COLOUR = 1e-3
 
 # Cone-like responses for chromatic adaptation, from CIE XYZ (Bradford). ICC.1:2010, annex E.3.
 BRADFORD = np.array(
@@ -1033,13 +1046,13 @@ def _to_bt709(image: Floats, part: _Part, is_xyz: bool, notes: list[str]) -> Flo
         return image
     given = XYZ if is_xyz else _chromaticities(part)
     matrix = _rgb_to_xyz(given)
-    absolute = np.allclose(given, XYZ, rtol=0, atol=SAME_CHROMATICITY)
+    absolute = np.allclose(given, XYZ, rtol=0, atol=SAME_COLOUR)
     neutral = BT709[6:] if absolute else given[6:]
     if "adoptedNeutral" in part.attributes:
         neutral = _value(part.attributes, "adoptedNeutral", "<ff")
-    if np.allclose((*given[:6], *neutral), BT709, rtol=0, atol=SAME_CHROMATICITY):
-        return image
     to_bt709 = np.linalg.inv(_rgb_to_xyz(BT709)) @ _adaptation(neutral) @ matrix
+    if np.allclose(to_bt709, np.eye(3), rtol=0, atol=SAME_COLOUR):
+        return image
     space = "CIE XYZ" if absolute else f"primaries {', '.join(f'{c:.4g}' for c in given[:6])}"
     notes.append(
         f"Colours are converted from {space} to BT.709, white from ({neutral[0]:.4g}, "
