@@ -299,8 +299,8 @@ class VDM(nn.Module):
         # stays in the processor's cache.
         step = 1 if details[0].numel() > LARGEST_AT_ONCE else details[0].shape[2]
         local: list[Tensor] = []
-        for parts in zip(*(detail.split(step, 2) for detail in details), strict=True):
-            difference = _response_difference(*parts, *around)
+        for one, other in zip(*(detail.split(step, 2) for detail in details), strict=True):
+            difference = _response_difference(one, other, *around)
             if self.effects.pooling:
                 local.append(_pooled_difference(surround(difference), exponent))
             else:
@@ -468,7 +468,7 @@ def _compiled(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
     def call(*arguments: object) -> Tensor:
         # Without this, two sides that are equal in the first image are taken to be equal always,
         # and the first image that is not square compiles everything again.
-        with fx_config.patch(use_duck_shape=False):
+        with fx_config.patch(use_duck_shape=False):  # type: ignore[attr-defined]
             return compiled(*arguments)
 
     return call

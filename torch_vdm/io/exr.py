@@ -1,0 +1,251 @@
+"""The OpenEXR container.
+
+A file is taken apart here, before the OpenEXR library sees any of it: only the blocks of pixels of
+the part that is wanted reach the library, behind a new header of nine attributes. So a damaged,
+truncated or hostile file is refused before memory is set aside for it, attributes that the library
+does not know do no harm, and a part that is not wanted costs nothing.
+
+OpenEXR is imported where it is used: importing the package stays fast.
+"""
+
+import io
+import struct
+
+import numpy as np
+
+from torch_vdm.io.exr_colour import BT709, colours
+from torch_vdm.io.exr_header import (
+    LONG_NAMES,
+    TILED,
+    Part,
+    damaged,
+    listed,
+    read_headers,
+    short,
+    value_of,
+)
+from torch_vdm.io.refusal import Floats, ImageError, check_size
+
+# Rows in a block of a scanline part, by the number of the compression: none, RLE, ZIPS, ZIP, PIZ,
+# PXR24, B44, B44A, DWAA, DWAB, HTJ2K256, HTJ2K32, LJ2K, ZSTD.
+_BLOCK_ROWS = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256, 256, 32, 256, 1)
+
+# Channels that make an image, in the order in which they are looked for.
+_MODELS = (("R", "G", "B"), ("Y", "RY", "BY"), ("X", "Y", "Z"), ("Y",))
+
+
+def load_exr(data: bytes, wanted: int | str | None, nonfinite: str, notes: list[str]) -> Floats:
+    """Return the linear BT.709 pixels, (3, H, W); what was assumed goes to ``notes``."""
+    parts, table, long_names = read_headers(data)
+    index, names = _choose(parts, wanted, notes)
+    part = parts[index]
+    _check(part, len(data))
+    for other in parts[:index]:
+        table += 8 * value_of(other.attributes, "chunkCount", "<i")[0]
+    blocks = _blocks(data, part, table, index if len(parts) > 1 else None)
+    planes = _decoded(_one_part(part, blocks, long_names), names)
+    return colours(part, names, planes, nonfinite, notes)
+
+
+def _choose(
+    parts: list[Part], wanted: int | str | None, notes: list[str]
+) -> tuple[int, tuple[str, ...]]:
+    """The index of the part to read, and the names of the channels to read from it."""
+    everything = range(len(parts))
+    found = [_channel_names(part) for part in parts]
+    if isinstance(wanted, int):
+        if wanted not in everything:
+            raise ImageError(f"expected a part from 0 to {len(parts) - 1}, got {wanted}")
+        candidates = [wanted]
+    elif wanted is None:
+        candidates = [i for i in everything if found[i]]
+        # A stable sort: parts that have plain R, G, B come first, deep ones last.
+        candidates.sort(key=lambda i: (parts[i].deep, found[i] != _MODELS[0]))
+    else:
+        candidates = [i for i in everything if parts[i].name == wanted]
+        if not candidates:
+            found = [_channel_names(part, wanted) for part in parts]
+            candidates = [i for i in everything if found[i]]
+        if not candidates:
+            raise ImageError(
+                f"expected a part or a layer named {short(wanted)!r}, got parts "
+                f"{listed([repr(part.name) for part in parts])}"
+            )
+    index = candidates[0] if candidates else 0
+    part, names = parts[index], found[index]
+    if part.deep:
+        raise ImageError(
+            "expected one sample a pixel, got a deep image; flatten it where it is rendered"
+        )
+    if not names:
+        raise ImageError(
+            f"expected channels R, G, B, or Y, RY, BY, or Y, got {listed(list(part.channels))}; "
+            "export it with colour channels"
+        )
+    if len(parts) > 1:
+        notes.append(f"Of {len(parts)} parts, part {index} ({short(part.name)!r}) is read.")
+    if "." in names[0]:
+        notes.append(f"The image is read from the channels {listed(list(names))}.")
+    if any(part.channels[name].kind == 0 for name in names):
+        notes.append("The channels hold whole numbers, which are taken as they are.")
+    others = [name for name in part.channels if name not in names]
+    if others:
+        notes.append(f"Channels that are not used: {listed(others)}.")
+    return index, names
+
+
+def _channel_names(part: Part, layer: str | None = None) -> tuple[str, ...]:
+    """The channels that make the image, or the given layer; empty if there are none."""
+    layers = [layer] if layer is not None else [""]
+    if layer is None:
+        layers += [name[:-2] for name in part.channels if name.endswith(".R")]
+    for prefix in layers:
+        for model in _MODELS if prefix in ("", layer) else _MODELS[:1]:
+            names = tuple(f"{prefix}.{name}" if prefix else name for name in model)
+            if all(name in part.channels for name in names):
+                return names
+    return ()
+
+
+def _check(part: Part, size: int) -> None:
+    """Refuse a header of which the library would have to trust something."""
+    width, height = part.size
+    samples = 0
+    for name, channel in part.channels.items():
+        x_step, y_step = channel.step
+        if (x_step, y_step) != (1, 1) and part.tiled:
+            raise damaged(f"channel {short(name)!r} is subsampled in a tiled file")
+        if any(edge % x_step for edge in (part.window[0], width)) or any(
+            edge % y_step for edge in (part.window[1], height)
+        ):
+            raise damaged(f"the sampling of channel {short(name)!r} does not fit the data window")
+        samples += channel.bytes * (width // x_step) * (height // y_step)
+    check_size(width, height, samples, size)
+    shown = part.display[2] - part.display[0] + 1, part.display[3] - part.display[1] + 1
+    check_size(*shown, 12 * shown[0] * shown[1], size)
+    (compression,) = value_of(part.attributes, "compression", "<B")
+    if compression >= len(_BLOCK_ROWS):
+        raise damaged(f"compression {compression} is not known")
+    if part.tiled:
+        columns, rows, _ = value_of(part.attributes, "tiles", "<IIB")
+        if columns == 0 or rows == 0:
+            raise damaged(f"its tiles are {columns} x {rows} pixels")
+        # The library sets memory aside for a whole tile even where the image is smaller.
+        check_size(columns, rows, columns * rows * 4 * len(part.channels), size)
+
+
+def _blocks(
+    data: bytes, part: Part, table: int, index: int | None
+) -> list[tuple[bytes, memoryview]]:
+    """Every block of the full-resolution image: where it stands in it, and its compressed data.
+
+    `table` is where the part's table of offsets begins, `index` the number of the part in a file
+    that has several. The first entries of a table are those of the full resolution.
+    """
+    width, height = part.size
+    if part.tiled:
+        columns, rows, _ = value_of(part.attributes, "tiles", "<IIB")
+        across = -(-width // columns)
+        places = [
+            struct.pack("<iiii", x, y, 0, 0)
+            for y in range(-(-height // rows))
+            for x in range(across)
+        ]
+        moved = places
+    else:
+        rows = _BLOCK_ROWS[value_of(part.attributes, "compression", "<B")[0]]
+        top = part.window[1]
+        places = [struct.pack("<i", y) for y in range(top, top + height, rows)]
+        moved = [struct.pack("<i", y) for y in range(0, height, rows)]
+    if table < 0 or table + 8 * len(places) > len(data):
+        raise ImageError(
+            f"incomplete: the file ends in the table of its {len(places)} blocks of pixels; "
+            "render or copy it again"
+        )
+    offsets = struct.unpack_from(f"<{len(places)}Q", data, table)
+    blocks = []
+    view = memoryview(data)  # a slice of it is no copy
+    missing = 0
+    for offset, place, new_place in zip(offsets, places, moved, strict=True):
+        leader = place if index is None else struct.pack("<i", index) + place
+        begin = offset + len(leader) + 4
+        if offset == 0 or begin > len(data):
+            missing += 1
+            continue
+        if data[offset : begin - 4] != leader:
+            raise damaged("its table of blocks of pixels does not lead to them")
+        (size,) = struct.unpack_from("<i", data, begin - 4)
+        if size <= 0:
+            raise damaged(f"a block of pixels has {size} bytes")
+        if begin + size > len(data):
+            missing += 1
+            continue
+        blocks.append((new_place, view[begin : begin + size]))
+    if missing:
+        raise ImageError(
+            f"incomplete: {missing} of {len(places)} blocks of pixels are missing or cut off; "
+            "render or copy it again"
+        )
+    return blocks
+
+
+def _one_part(part: Part, blocks: list[tuple[bytes, memoryview]], long_names: bool) -> bytes:
+    """An OpenEXR file of this part alone, its data window moved to the origin."""
+    width, height = part.size
+    window = struct.pack("<iiii", 0, 0, width - 1, height - 1)
+    attributes = [
+        ("channels", "chlist", part.attributes["channels"]),
+        ("compression", "compression", part.attributes["compression"]),
+        ("dataWindow", "box2i", window),
+        ("displayWindow", "box2i", window),
+        ("lineOrder", "lineOrder", b"\0"),
+        ("pixelAspectRatio", "float", struct.pack("<f", 1)),
+        ("screenWindowCenter", "v2f", struct.pack("<ff", 0, 0)),
+        ("screenWindowWidth", "float", struct.pack("<f", 1)),
+    ]
+    if part.tiled:
+        tile = part.attributes["tiles"][:8] + b"\0"  # one level
+        attributes.append(("tiles", "tiledesc", tile))
+    flags = 2 | (TILED if part.tiled else 0) | (LONG_NAMES if long_names else 0)
+    head = struct.pack("<II", 20000630, flags)
+    for name, kind, value in attributes:
+        head += f"{name}\0{kind}\0".encode() + struct.pack("<i", len(value)) + value
+    head += b"\0"
+    at = len(head) + 8 * len(blocks)
+    offsets: list[int] = []
+    body: list[bytes | memoryview] = []
+    for place, block in blocks:
+        offsets.append(at)
+        body += [place, struct.pack("<i", len(block)), block]
+        at += len(place) + 4 + len(block)
+    return b"".join([head, struct.pack(f"<{len(offsets)}Q", *offsets), *body])
+
+
+def _decoded(data: bytes, names: tuple[str, ...]) -> list[Floats]:
+    import OpenEXR
+
+    try:
+        parts = OpenEXR.File(io.BytesIO(data), separate_channels=True).parts
+    except Exception as error:
+        raise damaged(f"the OpenEXR library refuses it ({error})") from error
+    if not parts:  # it prints a warning and leaves out a part that it cannot read
+        raise damaged("its blocks of pixels cannot be decompressed")
+    return [parts[0].channels[name].pixels.astype(np.float32) for name in names]
+
+
+def encode_exr(planes: Floats) -> bytes:
+    """Return (3, H, W) or (1, H, W) as a file of float channels R, G, B or Y."""
+    import OpenEXR
+
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "chromaticities": BT709,
+    }
+    names = "Y" if len(planes) == 1 else "RGB"
+    channels = {
+        name: np.ascontiguousarray(plane) for name, plane in zip(names, planes, strict=True)
+    }
+    stream = io.BytesIO()
+    OpenEXR.File(header, channels).write(stream)
+    return stream.getvalue()
