@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torch_vdm import Display, pixels_per_degree
-from torch_vdm.display import BRIGHTEST, BT709_TO_XYZ, decode_srgb
+from torch_vdm.display import BRIGHTEST, BT709_TO_XYZ, decode_srgb, encode_srgb
 
 PRIMARIES = torch.tensor(BT709_TO_XYZ, dtype=torch.float64)
 
@@ -21,6 +21,24 @@ def test_srgb_is_decoded_as_kornia_does() -> None:
     coded = torch.linspace(0.0, 1.0, 512, dtype=torch.float64).expand(1, 3, 1, 512)
     expected = kornia.color.rgb_to_linear_rgb(coded)
     torch.testing.assert_close(decode_srgb(coded), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_encoding_undoes_decoding() -> None:
+    coded = torch.linspace(-0.1, 1.5, 256, dtype=torch.float64)
+    # The standard's two rounded ends of the linear part differ by 3e-8.
+    torch.testing.assert_close(encode_srgb(decode_srgb(coded)), coded, rtol=0.0, atol=1e-6)
+
+
+def test_codes_are_those_of_the_light_over_white() -> None:
+    light = 50.0 * random_image()
+    expected = encode_srgb(light / 100.0)
+    for display, image in (
+        (Display.linear(200.0), light / 100.0),
+        (Display.linear(200.0, exposure=1.0), light / 200.0),
+        (Display.xyz(), light),
+        (Display.srgb(), expected),
+    ):
+        torch.testing.assert_close(display.to_code(image), expected)
 
 
 def test_srgb_to_xyz_is_that_of_kornia() -> None:

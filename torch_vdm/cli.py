@@ -15,10 +15,16 @@ import torch
 from torch import Tensor
 
 from torch_vdm import __version__
-from torch_vdm.display import BT709_TO_XYZ, Display, decode_srgb, pixels_per_degree
+from torch_vdm.display import (
+    BT709_TO_XYZ,
+    Display,
+    decode_srgb,
+    encode_srgb,
+    pixels_per_degree,
+)
 from torch_vdm.io import ImageError, atomic_path, load, write_image
 from torch_vdm.observer import Observer
-from torch_vdm.report import Comparison, encode_srgb, figures, table, write_heat_map
+from torch_vdm.report import Comparison, figures, table, write_heat_map
 from torch_vdm.vdm import VDM
 
 DONE, EXCEEDED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130

@@ -18,6 +18,12 @@ BT709_TO_XYZ = (
 # The sRGB transfer of IEC 61966-2-1: slope and end of the linear part, offset, exponent.
 SRGB_SLOPE, SRGB_KNEE, SRGB_OFFSET, SRGB_EXPONENT = 12.92, 0.04045, 0.055, 2.4
 
+# Where the linear part ends, in light. Source: the same.
+SRGB_TOE = 0.0031308
+
+# What `Display.to_code` takes as white where the image is absolute XYZ, in cd/m2. Status: choice.
+XYZ_WHITE = 100.0
+
 # Light beyond this, in cd/m2, is held to it: the sun's disc has about 1.6e9 cd/m2, and the sum of
 # four pixels must stay finite in float32. Status: choice.
 BRIGHTEST = 1e12
@@ -96,6 +102,26 @@ class Display:
             limit = BRIGHTEST / self.gain
             return mix(primaries * self.gain, image.clamp(-limit, limit))
         return image.clamp(-BRIGHTEST, BRIGHTEST)
+
+    def to_code(self, image: Tensor) -> Tensor:
+        """Return sRGB-coded values: those of an sRGB display, or of light over white.
+
+        For XYZ, which has no white, light over 100 cd/m2. Over 1 the curve's power goes on, below
+        0 its linear part. (B, 3, H, W) to the same shape, for a loss: 0.01 is about as visible
+        on black as on white.
+        """
+        if self.encoding == "srgb":
+            return image.clamp(-LARGEST_CODE, LARGEST_CODE)
+        white = XYZ_WHITE if self.encoding == "xyz" else self.white
+        light = image * (self.gain / white)
+        return encode_srgb(light.clamp(-BRIGHTEST, BRIGHTEST))
+
+
+def encode_srgb(light: Tensor) -> Tensor:
+    """Return the sRGB-coded values of linear ones (IEC 61966-2-1), 1.0 to 1.0, not clipped."""
+    # The power never sees a base whose gradient is not finite.
+    power = (1.0 + SRGB_OFFSET) * light.clamp_min(SRGB_TOE) ** (1.0 / SRGB_EXPONENT) - SRGB_OFFSET
+    return torch.where(light <= SRGB_TOE, SRGB_SLOPE * light, power)
 
 
 def decode_srgb(image: Tensor) -> Tensor:

@@ -1,7 +1,9 @@
 """The metric as a training loss."""
 
+import math
 from typing import Any, Literal
 
+import torch
 from torch import Tensor, nn
 
 from torch_vdm.display import Display
@@ -9,36 +11,82 @@ from torch_vdm.vdm import VDM
 
 Reduction = Literal["mean", "sum", "none"]
 
+# Weight of the L1 term. Status: choice, by experiment: the smallest of 0, 30, 60, 120 and 240 from
+# which 300 steps of Adam bring a photograph back under 0.1 JND everywhere, from noise, from flat
+# grey, black and white, and from a shift by 8 pixels.
+L1 = 120.0
+
 
 class VDMLoss(nn.Module):
-    """The mean over all pixels of the map to the power of 2.4: before the root.
+    """A perceptual loss: the mean of log(1 + p), and an L1 term.
 
-    Finite with a finite gradient for every finite image; 0 with gradient 0 for equal images.
+    p is the map of `VDM` to the power of 2.4, before its root: smooth, 0 with gradient 0 where the
+    images are equal. The logarithm keeps far-off regions from drowning the rest: near threshold
+    the loss orders images as the map does, far from it it grows with the logarithm of the JND.
+
+    The L1 term is the mean absolute difference of sRGB-coded values (of light over the display's
+    white, for a display that takes light). It recovers what nobody sees, such as detail beyond the
+    eye's resolution, and finds the way where the metric alone has local minima.
+
+    Finite with a finite gradient for every finite image.
 
     Parameters
     ----------
     ppd, display, options
         As in `VDM`.
+    l1
+        Weight of the L1 term; 0: the metric alone.
     reduction
         Over the batch: "mean", "sum", or "none" for one value an item, (B,).
+
+    Raises
+    ------
+    ValueError
+        Where a parameter or an image is not as stated.
     """
 
     def __init__(
         self,
         ppd: float = 60.0,
         display: Display | None = None,
+        l1: float = L1,
         reduction: Reduction = "mean",
         **options: Any,
     ) -> None:
         super().__init__()
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f'expected reduction "mean", "sum" or "none", got {reduction!r}')
+        if not (math.isfinite(l1) and l1 >= 0.0):
+            raise ValueError(f"expected a weight l1 of 0 or more, got {l1}")
         self.metric = VDM(ppd, display, **options)
+        self.l1 = l1
         self.reduction = reduction
 
-    def forward(self, test: Tensor, reference: Tensor) -> Tensor:
-        """Return the loss of (B, 3, H, W) against (B, 3, H, W)."""
-        items = self.metric.power(test, reference).mean((1, 2, 3))
+    def forward(self, test: Tensor, reference: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Return the loss of (B, 3, H, W) against (B, 3, H, W).
+
+        ``mask`` (B, 1, H, W) weights the pixels, 0 to leave one out; a pixel that is left out
+        still is what its neighbours are seen against.
+        """
+        plane = torch.log1p(self.metric.power(test, reference))
+        if self.l1:
+            difference = self._coded(test, plane.dtype) - self._coded(reference, plane.dtype)
+            seen = torch.where(torch.isfinite(difference), difference.abs(), 0.0)
+            plane = plane + self.l1 * seen.mean(1, keepdim=True)
+        items = _mean(plane, mask)
         if self.reduction == "mean":
             return items.mean()
         return items.sum() if self.reduction == "sum" else items
+
+    def _coded(self, image: Tensor, dtype: torch.dtype) -> Tensor:
+        return self.metric.display.to_code(image.to(dtype))
+
+
+def _mean(plane: Tensor, mask: Tensor | None) -> Tensor:
+    """Return the mean of every item, (B,), weighted where there is a mask."""
+    if mask is None:
+        return plane.mean((1, 2, 3))
+    if mask.shape != plane.shape:
+        raise ValueError(f"expected a mask of shape {tuple(plane.shape)}, got {tuple(mask.shape)}")
+    weights = mask.to(plane.dtype)
+    return (plane * weights).sum((1, 2, 3)) / weights.sum((1, 2, 3)).clamp_min(torch.finfo(plane.dtype).tiny)

@@ -5,7 +5,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
-import torch
 from torch import Tensor
 
 from torch_vdm.io import atomic_path
@@ -171,11 +170,3 @@ def write_heat_map(path: Path, reference: Tensor, test: Tensor, jnd: Tensor, tit
     figure.suptitle(title, fontsize=10)
     with atomic_path(path) as temporary:
         figure.savefig(temporary)
-
-
-def encode_srgb(linear: Tensor) -> Tensor:
-    """Return the sRGB-coded values in [0, 1] of linear ones, clipped (IEC 61966-2-1)."""
-    linear = linear.clamp(0.0, 1.0)
-    return torch.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(1e-4) ** (1 / 2.4) - 0.055
-    )
