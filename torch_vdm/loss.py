@@ -89,4 +89,6 @@ def _mean(plane: Tensor, mask: Tensor | None) -> Tensor:
     if mask.shape != plane.shape:
         raise ValueError(f"expected a mask of shape {tuple(plane.shape)}, got {tuple(mask.shape)}")
     weights = mask.to(plane.dtype)
-    return (plane * weights).sum((1, 2, 3)) / weights.sum((1, 2, 3)).clamp_min(torch.finfo(plane.dtype).tiny)
+    return (plane * weights).sum((1, 2, 3)) / weights.sum((1, 2, 3)).clamp_min(
+        torch.finfo(plane.dtype).tiny
+    )

@@ -252,7 +252,7 @@ class VDM(nn.Module):
         one, other = first.lowpass[0], second.lowpass[0]
         constants = self._constants(one.dtype)
         if self.observer.lowpass_gains is None:
-            return torch.zeros_like(one[:, :1])
+            return 0.0 * one[:, :1]  # of the graph, so that an image of one pixel has a gradient
         contrast = weber_contrast(one, other, constants["dark_cones"])
         gains = constants["lowpass_gains"].view(-1, 1, 1)
         return (opponents(contrast, constants["opponents"]) * gains).abs()
@@ -373,7 +373,7 @@ class VDM(nn.Module):
             )
         double = torch.float64 in (test.dtype, reference.dtype)
         dtype = torch.float64 if double else torch.float32
-        test, reference = test.to(dtype), reference.to(dtype)
+        test, reference = _widened(test, dtype), _widened(reference, dtype)
         if self.nonfinite == "mask":
             seen = (torch.isfinite(test) & torch.isfinite(reference)).all(1, keepdim=True)
             return torch.where(seen, test, 0.0), torch.where(seen, reference, 0.0), seen
@@ -458,6 +458,31 @@ def _pooled_difference(surrounded: Tensor, exponent: Tensor) -> Tensor:
     absolute difference, for neighbours alternate and would cancel.
     """
     return local_visual_difference(pool(surrounded), exponent)
+
+
+class _Widen(torch.autograd.Function):
+    """A cast to more bits whose gradient saturates on the way back instead of overflowing."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(image: Tensor, dtype: torch.dtype) -> Tensor:
+        return image.to(dtype)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, torch.dtype], _: Tensor) -> None:
+        ctx.dtype = inputs[0].dtype
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        largest = torch.finfo(ctx.dtype).max
+        return gradient.clamp(-largest, largest).to(ctx.dtype), None
+
+
+def _widened(image: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return an image in ``dtype``, which holds at least as much as its own."""
+    widened: Tensor = image if image.dtype == dtype else _Widen.apply(image, dtype)
+    return widened
 
 
 @cache
