@@ -7,6 +7,9 @@ from torch import Tensor
 
 from torch_vdm.quadtree import push
 
+# A difference over this is visible, in JND: the unit's definition.
+VISIBLE = 1.0
+
 
 def local_visual_difference(difference: Tensor, exponent: Tensor) -> Tensor:
     """Return the local visual difference of every node (Eq. 5).

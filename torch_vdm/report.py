@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING, TypedDict
 
 from torch import Tensor
 
+from torch_vdm.distance import VISIBLE
 from torch_vdm.io import atomic_path
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
-
-# A difference over this is visible, in JND: the unit's definition.
-VISIBLE = 1.0
 
 # What a heat map's colours are cut at where the largest difference is smaller, in JND, so that
 # invisible differences look like nothing. Status: choice.
