@@ -173,5 +173,5 @@ def _plot(result: dict[str, Any], path: Path) -> None:
     axis.grid(axis="x", alpha=0.3)
     axis.set_xlabel("largest error against float64, relative (1e-9: none)")
     axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(frameon=False, title="images in")
+    axis.legend(frameon=False, title="images in", loc="center", bbox_to_anchor=(0.35, 0.5))
     figure.savefig(path)

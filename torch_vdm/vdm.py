@@ -83,10 +83,6 @@ class VDM(nn.Module):
         Where a parameter or an image is not as stated.
     """
 
-    cones: Tensor
-    frequencies: Tensor
-    gains: Tensor
-
     def __init__(
         self,
         ppd: float = 60.0,
