@@ -1,12 +1,10 @@
 """The visual difference metric: the stages of Fig. 2, in order. Only this file knows the order."""
 
-from collections.abc import Callable, Iterator
-from functools import cache
+from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
-from torch.fx.experimental import _config as fx_config
 
 from torch_vdm.aberration import attenuation
 from torch_vdm.cones import XYZ_TO_SML, cone_responses
@@ -22,6 +20,7 @@ from torch_vdm.csf import barten, butterworth, dimming
 from torch_vdm.display import BT709_TO_XYZ, Display
 from torch_vdm.distance import accumulate, just_noticeable, local_visual_difference
 from torch_vdm.effects import Effects
+from torch_vdm.fast import SMALLEST, compiled
 from torch_vdm.masking import energy_transducer, signed_transducer
 from torch_vdm.matrix import mix
 from torch_vdm.observer import Observer
@@ -32,10 +31,6 @@ Nonfinite = Literal["raise", "mask"]
 
 # Levels that the constants are made for: an image of 2^24 pixels a side.
 DEEPEST = 24
-
-# Levels with fewer coefficients stay uncompiled: a compiled call costs more than they do.
-# Status: choice.
-SMALLEST_COMPILED = 4096
 
 # Planes with more numbers are computed in parts. Status: choice, measured.
 LARGEST_AT_ONCE = 2**20
@@ -213,11 +208,11 @@ class VDM(nn.Module):
         constants = self._constants(image.dtype)
         around = self.display, constants["primaries"], constants["cones"]
         if self._fast:
-            planes = _compiled(_light)(image, *around)
+            planes = compiled(_light)(image, *around)
         else:
             rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
             planes = torch.cat([_light(part, *around) for part in image.split(rows, -2)], -2)
-        return self.transform.decompose(planes)
+        return self.transform.decompose(planes, self._fast)
 
     def respond(self, cortex: Cortex) -> tuple[Tensor, ...]:
         """Return the responses of one image: chromatic aberration to the transducer.
@@ -286,10 +281,10 @@ class VDM(nn.Module):
             self.effects.masking,
         )
         exponent = constants["summation_exponent"]
-        if self._fast and details[0].numel() >= SMALLEST_COMPILED:
-            difference = _compiled(_response_difference)(*details, *around)
+        if self._fast and details[0].numel() >= SMALLEST:
+            difference = compiled(_response_difference)(*details, *around)
             if self.effects.pooling:
-                return _compiled(_pooled_difference)(surround(difference), exponent)
+                return compiled(_pooled_difference)(surround(difference), exponent)
             return local_visual_difference(difference, exponent)
         # One orientation at a time where the planes are large: what is computed on the way then
         # stays in the processor's cache.
@@ -314,26 +309,21 @@ class VDM(nn.Module):
         """
         parent = cortex.parent_lowpass(number)
         size = (cortex.details[number].shape[-2], cortex.details[number].shape[-1])
-        scale = adapted(parent, constants["dark_cones"]).reciprocal()
-        if self.effects.aberration:
-            passed = attenuation(
-                level.frequency, constants["aberration_cutoff"], constants["aberration_exponent"]
-            )
-            scale = scale * passed.view(3, 1, 1)
+        fast = self._fast and parent.numel() >= SMALLEST
+        at_parents = compiled(_scale_and_sensitivity) if fast else _scale_and_sensitivity
+        scale, sensitivity = at_parents(
+            parent, level, constants, self.observer.adaptation_luminance is None, self.effects
+        )
         if self.observer.adaptation_luminance is None:
-            seen = mix(constants["luminance_of_cones"], parent).clamp_min(0.0)
-            luminance = seen + constants["dark_light"]
-            sensitivity = push(_sensitivity(luminance, level, constants, self.effects), size)
-        else:
-            luminance = constants["adaptation_luminance"].view(1, 1, 1, 1)
-            sensitivity = _sensitivity(luminance, level, constants, self.effects)
+            sensitivity = push(sensitivity, size)
         return push(scale, size), sensitivity
 
     def _levels(self, cortex: Cortex, constants: dict[str, Tensor]) -> list[Level]:
         """Return what each level of ``cortex`` responds to, level 0 (the coarsest) first."""
         count = len(cortex.details)
         frequencies, gains = constants["frequencies"], constants["gains"]
-        return [Level(frequencies[n], gains[n]) for n in reversed(range(count))]
+        # Copies, for compiled code is specialised on the offset of a view.
+        return [Level(frequencies[n].clone(), gains[n].clone()) for n in reversed(range(count))]
 
     def _constants(self, dtype: torch.dtype) -> dict[str, Tensor]:
         """Return the constants in the precision of the computation."""
@@ -425,6 +415,24 @@ def _response_difference(
     return (response - other).abs() if signed else response - other
 
 
+def _scale_and_sensitivity(
+    parent: Tensor, level: Level, constants: dict[str, Tensor], local: bool, effects: Effects
+) -> tuple[Tensor, Tensor]:
+    """Return what `VDM._sight` pushes to the nodes, on the plane of their parents."""
+    scale = adapted(parent, constants["dark_cones"]).reciprocal()
+    if effects.aberration:
+        passed = attenuation(
+            level.frequency, constants["aberration_cutoff"], constants["aberration_exponent"]
+        )
+        scale = scale * passed.view(3, 1, 1)
+    if local:
+        seen = mix(constants["luminance_of_cones"], parent).clamp_min(0.0)
+        luminance = seen + constants["dark_light"]
+    else:
+        luminance = constants["adaptation_luminance"].view(1, 1, 1, 1)
+    return scale, _sensitivity(luminance, level, constants, effects)
+
+
 def _sensitivity(
     luminance: Tensor, level: Level, constants: dict[str, Tensor], effects: Effects
 ) -> Tensor:
@@ -479,20 +487,6 @@ def _widened(image: Tensor, dtype: torch.dtype) -> Tensor:
     """Return an image in ``dtype``, which holds at least as much as its own."""
     widened: Tensor = image if image.dtype == dtype else _Widen.apply(image, dtype)
     return widened
-
-
-@cache
-def _compiled(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Return the compiled form of a function of planes, for every size."""
-    compiled = torch.compile(function, dynamic=True, fullgraph=True)
-
-    def call(*arguments: object) -> Tensor:
-        # Without this, two sides that are equal in the first image are taken to be equal always,
-        # and the first image that is not square compiles everything again.
-        with fx_config.patch(use_duck_shape=False):  # type: ignore[attr-defined]
-            return compiled(*arguments)
-
-    return call
 
 
 def _items(batch: Tensor) -> Iterator[Tensor]:

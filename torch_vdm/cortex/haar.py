@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_vdm.cortex.transform import Cortex
+from torch_vdm.fast import SMALLEST, compiled
 from torch_vdm.quadtree import pad_even
 
 
@@ -15,8 +16,8 @@ from torch_vdm.quadtree import pad_even
 class Haar:
     """The paper's transform: O(N), one coefficient a pixel and cone, not shift-invariant."""
 
-    def decompose(self, planes: Tensor) -> Cortex:
-        """Decompose (B, C, H, W) by Eq. 2 down to one node.
+    def decompose(self, planes: Tensor, fast: bool = False) -> Cortex:
+        """Decompose (B, C, H, W) by Eq. 2 down to one node, by compiled steps if ``fast``.
 
         Returns
         -------
@@ -26,7 +27,8 @@ class Haar:
         details: list[Tensor] = []
         lowpass: list[Tensor] = []
         while max(planes.shape[-2:]) > 1:
-            planes, detail = _analyse(planes)
+            step = compiled(_analyse) if fast and planes.numel() >= SMALLEST else _analyse
+            planes, detail = step(pad_even(planes))
             details.append(detail)
             lowpass.append(planes)
         return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [planes])))
@@ -36,9 +38,8 @@ class Haar:
         return _peak(level_from_finest)
 
 
-def _analyse(planes: Tensor) -> tuple[Tensor, Tensor]:
+def _analyse(even: Tensor) -> tuple[Tensor, Tensor]:
     """Return the lowpass (B, C, h/2, w/2) and the details (B, C, 3, h/2, w/2) of a plane, Eq. 2."""
-    even = pad_even(planes)
     top, bottom = even[..., 0::2, :], even[..., 1::2, :]
     sums, differences = (top + bottom).mul_(0.25), (top - bottom).mul_(0.25)
     left, right = sums[..., 0::2], sums[..., 1::2]

@@ -28,8 +28,8 @@ class Cortex(NamedTuple):
 class Transform(Protocol):
     """A decomposition into levels on a quad-tree, and what each level responds to."""
 
-    def decompose(self, planes: Tensor) -> Cortex:
-        """Decompose (B, C, H, W) to the coarsest level."""
+    def decompose(self, planes: Tensor, fast: bool = False) -> Cortex:
+        """Decompose (B, C, H, W) to the coarsest level, by compiled steps if ``fast``."""
 
     def peak(self, level_from_finest: int) -> tuple[float, float]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there."""

@@ -1,0 +1,30 @@
+"""The fast route: functions of planes, compiled once for every size."""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import torch
+from torch.fx.experimental import _config
+
+# Planes with fewer numbers stay uncompiled: a compiled call costs more than they do.
+# Status: choice.
+SMALLEST = 4096
+
+
+@cache
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the compiled form of a pure function of tensors.
+
+    It serves every height and width. A batch of one is compiled apart from larger ones, so give
+    it one item at a time, and tensors that are no views, for it is specialised on offsets too.
+    """
+    specialised = torch.compile(function, dynamic=True, fullgraph=True)
+
+    def call(*arguments: object) -> Any:
+        # Without this, two sides that are equal in the first image are taken to be equal always,
+        # and the first image that is not square compiles everything again.
+        with _config.patch(use_duck_shape=False):  # type: ignore[attr-defined]
+            return specialised(*arguments)
+
+    return call
