@@ -2,6 +2,8 @@
 
 import json
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -165,6 +167,30 @@ def test_wrong_options_get_one_line(
     assert sorted(tmp_path.iterdir()) == before
 
 
+def test_outputs_never_take_the_place_of_inputs_or_of_each_other(
+    pair: Pair, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = Path(pair[0]).read_bytes()
+    shared = str(tmp_path / "both.png")
+    for options in (["--map", pair[0]], ["--json", pair[0]], ["--map", shared, "--json", shared]):
+        line = one_line_error(capsys, "compare", *pair, *options)
+        assert "expected a file of its own" in line
+    assert Path(pair[0]).read_bytes() == before
+    assert not Path(shared).exists()
+
+
+@pytest.mark.parametrize("options", [[], ["--json", "-"]])
+def test_a_reader_that_stops_reading_is_no_error(pair: Pair, options: list[str]) -> None:
+    command = [sys.executable, "-m", "torch_vdm", "compare", *pair, *options]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.close()
+    assert process.stderr is not None
+    assert process.stderr.read() == b""
+    process.stderr.close()
+    assert process.wait(timeout=120) == 0
+
+
 def test_wrong_files_get_one_line(
     pair: Pair, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -212,7 +238,7 @@ def test_interruption_is_one_line(
 
     monkeypatch.setattr("torch_vdm.cli.load", interrupted)
     assert main(["compare", *pair]) == 130
-    assert capsys.readouterr().err == "torch-vdm: interrupted; nothing was written\n"
+    assert capsys.readouterr().err == "torch-vdm: interrupted\n"
 
 
 def test_jnd_falls_with_samples_per_pixel(

@@ -35,7 +35,9 @@ def test_figures_are_those_of_numpy() -> None:
 def test_verdicts() -> None:
     assert "up to 3.2 JND (at x 4, y 5), in 25.0% of the image" in comparison().verdict()
     assert "under 0.1%" in comparison(visible_fraction=1e-4).verdict()
-    invisible = comparison(max_jnd=0.9, visible_fraction=0.0).verdict()
+    together = comparison(max_jnd=0.9, score_jnd=1.4).verdict()
+    assert together.startswith("Hardly visible at 60 pixels per degree")
+    invisible = comparison(max_jnd=0.9, score_jnd=0.8, visible_fraction=0.0).verdict()
     assert invisible.startswith("Nobody will see a difference at 60 pixels per degree")
 
 

@@ -174,7 +174,7 @@ def test_half_precision_input_is_computed_in_float32(dtype: torch.dtype) -> None
         (
             torch.zeros(3, 4, 4),
             torch.zeros(3, 4, 4),
-            r"test of shape \(B, 3, H, W\), got \(3, 4, 4",
+            r"test of shape \(B, 3, H, W\) with no side of 0, got \(3, 4, 4",
         ),
         (torch.zeros(1, 1, 4, 4), torch.zeros(1, 3, 4, 4), r"test of shape"),
         (torch.zeros(1, 3, 4, 4), torch.zeros(1, 3, 4, 0), r"reference of shape"),
@@ -192,10 +192,10 @@ def test_wrong_images_are_refused(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"ppd": 0.0}, "pixels per degree over 0, got 0"),
+        ({"ppd": 0.0}, "pixels per degree between 0.01 and 1e6, got 0"),
         ({"ppd": float("nan")}, "pixels per degree"),
-        ({"observer": "paper"}, "observer to be a Observer, got 'paper'"),
-        ({"effects": "auto"}, "effects to be a Effects"),
+        ({"observer": "paper"}, "observer: Observer, got 'paper'"),
+        ({"effects": "auto"}, "effects: Effects"),
         ({"nonfinite": "zero"}, '"raise" or "mask"'),
     ],
 )

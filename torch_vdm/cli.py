@@ -1,7 +1,10 @@
 """The command line, ``torch-vdm``."""
 
 import argparse
+import contextlib
+import io
 import math
+import os
 import shlex
 import sys
 import time
@@ -52,18 +55,21 @@ class _Parser(argparse.ArgumentParser):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``torch-vdm``; return its exit status."""
     options = _parser().parse_args(arguments)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A file's name may have letters that the terminal lacks.
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         if options.command == "demo":
             sample = files("torch_vdm") / "sample"
             with as_file(sample / "reference.exr") as one, as_file(sample / "test.exr") as other:
                 return _compare(one, other, options)
         return _compare(options.reference, options.test, options)
-    except (ImageError, _UsageError) as error:
+    except ValueError as error:  # of the library, one line each; ImageError is one
         print(f"torch-vdm: {error}", file=sys.stderr)
     except OSError as error:
         print(f"torch-vdm: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
     except KeyboardInterrupt:
-        print("torch-vdm: interrupted; nothing was written", file=sys.stderr)
+        print("torch-vdm: interrupted", file=sys.stderr)
         return INTERRUPTED
     return BAD_INPUT
 
@@ -169,6 +175,7 @@ class _Pair:
 
 
 def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
+    _check_outputs((reference, test), options)
     ppd, seen_from = _viewing(options)
     pair = _load_pair(reference, test, options)
     metric = VDM(ppd, pair.display, OBSERVERS[options.observer]())
@@ -182,7 +189,7 @@ def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
     comparison = Comparison(
         **figures(jnd),
         score_jnd=score,
-        mean_luminance_change=luminances[1] / luminances[0] - 1.0 if luminances[0] else None,
+        mean_luminance_change=luminances[1] / luminances[0] - 1.0 if luminances[0] > 0.0 else None,
         width=jnd.shape[1],
         height=jnd.shape[0],
         ppd=ppd,
@@ -199,14 +206,42 @@ def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
     elif options.map is not None:
         write_heat_map(options.map, *pair.coded(), jnd, comparison.verdict())
     if options.json == "-":
-        sys.stdout.write(comparison.to_json())
+        _tell(comparison.to_json())
     else:
         if options.json is not None:
             with atomic_path(Path(options.json)) as temporary:
                 temporary.write_text(comparison.to_json())
-        _print(comparison, luminances, options)
+        _tell(_text(comparison, luminances, options))
     exceeded = options.fail_above is not None and comparison.max_jnd > options.fail_above
     return EXCEEDED if exceeded else DONE
+
+
+def _check_outputs(inputs: tuple[Path, Path], options: argparse.Namespace) -> None:
+    """Refuse, before anything is computed, what could not be written or would destroy an input."""
+    taken = {Path(os.path.realpath(path)): path for path in inputs}
+    for path in (options.map, Path(options.json) if options.json not in (None, "-") else None):
+        if path is None:
+            continue
+        target = Path(os.path.realpath(path))
+        if target in taken:
+            raise _UsageError(
+                f"{path}: expected a file of its own to write to, got {taken[target]} again; "
+                "choose another name"
+            )
+        if not target.parent.is_dir():
+            raise _UsageError(f"{path}: expected the folder to exist; create it first")
+        taken[target] = path
+
+
+def _tell(text: str) -> None:
+    """Print, and do not mind a reader that has read enough."""
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Python flushes standard output once more at its end: let that go nowhere.
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _viewing(options: argparse.Namespace) -> tuple[float, str]:
@@ -278,17 +313,26 @@ def _reproduce(reference: Path, test: Path, ppd: float, options: argparse.Namesp
     return shlex.join(words)
 
 
-def _print(
+def _text(
     comparison: Comparison, luminances: tuple[float, float], options: argparse.Namespace
-) -> None:
-    """Print the table, the verdict, what was assumed and what was written."""
+) -> str:
+    """Return the table, the verdict, what was assumed and what was written."""
     from rich.console import Console
 
-    # Plain text: nothing in a path is markup, and no number is coloured.
-    console = Console(highlight=False, markup=False, soft_wrap=True)
+    terminal = Console()
+    # Plain text: nothing in a path is markup, and no number is coloured. Too narrow a terminal
+    # wraps lines; a table cut to its width would lose figures.
+    console = Console(
+        file=io.StringIO(),
+        force_terminal=terminal.is_terminal,
+        width=max(terminal.width, 72),
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
     console.print(table(comparison, luminances))
     console.print(comparison.verdict(), style="bold")
-    if options.observer == "paper" and luminances[0] != luminances[1]:
+    if options.observer == "paper" and not math.isclose(*luminances, rel_tol=1e-4):
         console.print(
             "The mean luminances differ, and the paper's observer never sees a uniform change; "
             "--observer calibrated does."
@@ -299,6 +343,8 @@ def _print(
     for path in (options.map, options.json):
         if path is not None:
             console.print(f"written: {path}", style="dim")
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
 
 
 def _part(text: str | None) -> int | str | None:

@@ -13,6 +13,10 @@ SML_TO_OPPONENTS = (
     (1.0111, -0.3877, 0.2670),
 )
 
+# Contrasts are held to this: light cannot pass 4, but values below 0, which are no light, have no
+# bound, and their powers would overflow. Status: choice.
+LARGEST = 1e10
+
 
 def adapted(lowpass: Tensor, dark_light: Tensor) -> Tensor:
     """Return what the cones are adapted to: their lowpass above 0 plus the eye's dark light.
@@ -39,7 +43,7 @@ def local_contrast(details: Tensor, scale: Tensor) -> Tensor:
     Tensor
         (B, 3, orientations, h, w), cone contrast without unit.
     """
-    return details * scale.unsqueeze(2)
+    return (details * scale.unsqueeze(2)).clamp(-LARGEST, LARGEST)
 
 
 def weber_contrast(first: Tensor, second: Tensor, dark_light: Tensor) -> Tensor:
@@ -48,7 +52,7 @@ def weber_contrast(first: Tensor, second: Tensor, dark_light: Tensor) -> Tensor:
     Antisymmetric; at most 2 for light that is not negative.
     """
     mean = 0.5 * (adapted(first, dark_light) + adapted(second, dark_light))
-    return (first - second) / mean
+    return ((first - second) / mean).clamp(-LARGEST, LARGEST)
 
 
 def opponents(contrast: Tensor, matrix: Tensor) -> Tensor:

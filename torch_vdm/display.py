@@ -55,6 +55,8 @@ class Display:
             raise ValueError(f"expected a luminance of white over 0 cd/m2, got {self.white}")
         if not (math.isfinite(self.exposure) and abs(self.exposure) <= 64.0):
             raise ValueError(f"expected an exposure within 64 stops, got {self.exposure}")
+        if not 1.0 / BRIGHTEST <= self.gain <= BRIGHTEST:
+            raise ValueError(f"expected 1.0 between 1e-12 and 1e12 cd/m2, got {self.gain:g}")
 
     @classmethod
     def srgb(cls, peak: float = 100.0, exposure: float = 0.0) -> Self:

@@ -5,11 +5,15 @@ from functools import cache
 from typing import Any
 
 import torch
+from torch._dynamo import config as _dynamo_config
 from torch.fx.experimental import _config
 
 # Planes with fewer numbers stay uncompiled: a compiled call costs more than they do.
 # Status: choice.
 SMALLEST = 4096
+
+# Forms of one function that are kept, by dtype, gradients and options. Status: choice.
+MOST_FORMS = 256
 
 
 @cache
@@ -22,9 +26,13 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     specialised = torch.compile(function, dynamic=True, fullgraph=True)
 
     def call(*arguments: object) -> Any:
-        # Without this, two sides that are equal in the first image are taken to be equal always,
-        # and the first image that is not square compiles everything again.
-        with _config.patch(use_duck_shape=False):  # type: ignore[attr-defined]
+        if torch.compiler.is_compiling():
+            return function(*arguments)
+        # Without the first, two sides that are equal in the first image are held equal for ever,
+        # and the first image that is not square compiles everything again. The second allows for
+        # every mix of precision, gradients, display, observer and effects in one process.
+        no_duck_shape = _config.patch(use_duck_shape=False)  # type: ignore[attr-defined]
+        with no_duck_shape, _dynamo_config.patch(recompile_limit=MOST_FORMS):
             return specialised(*arguments)
 
     return call

@@ -107,7 +107,7 @@ class Observer:
             dark_light=0.02,  # cd/m2, choice
             aberration_cutoff=5.24,  # cpd, fitted to a diffraction and defocus model of the eye
             aberration_exponent=2.15,
-            adaptation_luminance=None,  # choice: local, so that a tile answers as the whole
+            adaptation_luminance=None,  # choice: local, as the eye adapts
             level_gain=True,  # choice: a grating at a level's best frequency has its contrast
             achromatic_gain=1.0,  # source: Barten 1989
             achromatic_size=12.0,  # degrees, choice: the map never takes a size
@@ -121,7 +121,7 @@ class Observer:
             yellow_violet_exponent=0.2,
             transducer_exponent=0.4,  # choice: the growth of Eq. 4 far out, r^0.2
             summation_exponent=2.4,  # source: Eq. 5
-            lowpass_gains=(20.0, 76.0, 36.0),  # choice: a Weber contrast of 5 % is 1 JND
+            lowpass_gains=(20.0, 76.0, 36.0),  # choice: a change of the mean by 5 % is 1 JND
             score_exponent=4.0,
             score_coefficients=150.0,  # fitted: the median achromatic threshold scores 1
         )
@@ -129,4 +129,4 @@ class Observer:
     def numbers(self) -> dict[str, float]:
         """Return the parameters that are plain numbers, by name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value for name, value in values.items() if type(value) is float}
+        return {name: float(value) for name, value in values.items() if type(value) in (float, int)}

@@ -10,24 +10,12 @@ from torch import Tensor
 from torch.nn import functional
 
 
-def depth(height: int, width: int) -> int:
-    """Return the number of detail levels, ``ceil(log2(max(height, width)))``."""
-    return (max(height, width) - 1).bit_length()
-
-
 def pad_even(plane: Tensor) -> Tensor:
     """Repeat the last row and column of ``plane`` (B, C, h, w) where h or w is odd."""
     height, width = plane.shape[-2:]
     if height % 2 == 0 and width % 2 == 0:
         return plane
     return functional.pad(plane, (0, width % 2, 0, height % 2), mode="replicate")
-
-
-def pull(plane: Tensor) -> Tensor:
-    """Return the mean of every node's four children, (B, C, h, w) to half its size."""
-    even = pad_even(plane)
-    rows = even[..., 0::2, :] + even[..., 1::2, :]
-    return 0.25 * (rows[..., 0::2] + rows[..., 1::2])
 
 
 def push(nodes: Tensor, size: tuple[int, int]) -> Tensor:

@@ -59,8 +59,13 @@ class Comparison:
     def verdict(self) -> str:
         """Return one line: whether anybody can see the difference, at this distance."""
         where = f"at {self.ppd:g} pixels per degree"
-        if self.max_jnd <= VISIBLE:
+        if max(self.max_jnd, self.score_jnd) <= VISIBLE:
             return f"Nobody will see a difference {where}: it stays under 1 JND everywhere."
+        if self.max_jnd <= VISIBLE:
+            return (
+                f"Hardly visible {where}: under 1 JND at every single place, but the image as a "
+                f"whole may be told apart ({self.score_jnd:.1f} JND)."
+            )
         x, y = self.max_pixel
         share = f"{self.visible_fraction:.1%}" if self.visible_fraction >= 5e-4 else "under 0.1%"
         return (
@@ -70,7 +75,7 @@ class Comparison:
 
     def to_json(self) -> str:
         """Return the figures as JSON, one key a line."""
-        return json.dumps(asdict(self), indent=2) + "\n"
+        return json.dumps(asdict(self), indent=2, allow_nan=False) + "\n"
 
 
 def figures(jnd: Tensor) -> Figures:

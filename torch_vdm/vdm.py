@@ -88,15 +88,15 @@ class VDM(nn.Module):
         nonfinite: Nonfinite = "raise",
     ) -> None:
         super().__init__()
-        if not 0.0 < ppd < float("inf"):
-            raise ValueError(f"expected pixels per degree over 0, got {ppd}")
+        if not 0.01 <= ppd <= 1e6:
+            raise ValueError(f"expected pixels per degree between 0.01 and 1e6, got {ppd}")
         for name, option, kind in (
             ("display", display, Display),
             ("observer", observer, Observer),
             ("effects", effects, Effects),
         ):
             if not isinstance(option, kind | None):
-                raise ValueError(f"expected {name} to be a {kind.__name__}, got {option!r}")
+                raise ValueError(f"expected {name}: {kind.__name__}, got {option!r}")
         if nonfinite not in ("raise", "mask"):
             raise ValueError(f'expected nonfinite "raise" or "mask", got {nonfinite!r}')
         self.ppd = float(ppd)
@@ -192,13 +192,16 @@ class VDM(nn.Module):
         stimulus is easier to detect, where the map stays local.
         """
         test, reference, _ = self._checked(test, reference)
-        first, second = self.represent(test), self.represent(reference)
         constants = self._constants(test.dtype)
         exponent = constants["score_exponent"]
-        total = ((self.lowpass_difference(first, second)) ** exponent).sum((1, 2, 3))
-        for one, other in zip(self.respond(first), self.respond(second), strict=True):
-            total = total + ((one - other).abs() ** exponent).sum((1, 2, 3, 4))
-        return just_noticeable(total / constants["score_coefficients"], exponent)
+        totals = []
+        for one, other in self._parts(test, reference):
+            first, second = self.represent(one), self.represent(other)
+            total = (self.lowpass_difference(first, second) ** exponent).sum((1, 2, 3))
+            for seen, expected in zip(self.respond(first), self.respond(second), strict=True):
+                total = total + ((seen - expected).abs() ** exponent).sum((1, 2, 3, 4))
+            totals.append(total)
+        return just_noticeable(torch.cat(totals) / constants["score_coefficients"], exponent)
 
     def represent(self, image: Tensor) -> Cortex:
         """Return the cortex representation of an image: display, cones, transform.
@@ -208,7 +211,7 @@ class VDM(nn.Module):
         constants = self._constants(image.dtype)
         around = self.display, constants["primaries"], constants["cones"]
         if self._fast:
-            planes = compiled(_light)(image, *around)
+            planes: Tensor = compiled(_light)(image, *around)
         else:
             rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
             planes = torch.cat([_light(part, *around) for part in image.split(rows, -2)], -2)
@@ -235,12 +238,12 @@ class VDM(nn.Module):
         )
 
     def lowpass_difference(self, first: Cortex, second: Cortex) -> Tensor:
-        """Return the weighted contrast between the coarsest lowpass of two images.
+        """Return the weighted contrast between the means of two images, the lowpass term.
 
         (B, channels, 1, 1), not negative, 1 at threshold; 0 for an observer that never compares
         them. A uniform change is seen here and nowhere else.
         """
-        one, other = first.lowpass[0], second.lowpass[0]
+        one, other = first.mean, second.mean
         constants = self._constants(one.dtype)
         if self.observer.lowpass_gains is None:
             return 0.0 * one[:, :1]  # of the graph, so that an image of one pixel has a gradient
@@ -284,7 +287,10 @@ class VDM(nn.Module):
         if self._fast and details[0].numel() >= SMALLEST:
             difference = compiled(_response_difference)(*details, *around)
             if self.effects.pooling:
-                return compiled(_pooled_difference)(surround(difference), exponent)
+                local_difference: Tensor = compiled(_pooled_difference)(
+                    surround(difference), exponent
+                )
+                return local_difference
             return local_visual_difference(difference, exponent)
         # One orientation at a time where the planes are large: what is computed on the way then
         # stays in the processor's cache.
@@ -331,21 +337,29 @@ class VDM(nn.Module):
 
     def _total(self, test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor | None]:
         test, reference, seen = self._checked(test, reference)
-        if not self._fast:
-            return self.compare(self.represent(test), self.represent(reference)), seen
-        # A compiled function is specialised on a batch of one, so it gets nothing else.
-        items = [
+        totals = [
             self.compare(self.represent(one), self.represent(other))
-            for one, other in zip(_items(test), _items(reference), strict=True)
+            for one, other in self._parts(test, reference)
         ]
-        return torch.cat(items), seen
+        return torch.cat(totals), seen
+
+    def _parts(self, test: Tensor, reference: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yield both batches, whole or, on the fast route, item by item."""
+        if not self._fast or len(test) == 1:
+            return iter([(test, reference)])
+        # A compiled function is specialised on a batch of one and on the offset of a view.
+        return (
+            (one.clone(), other.clone())
+            for one, other in zip(test.split(1), reference.split(1), strict=True)
+        )
 
     def _checked(self, test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return both images in the computing precision, and where they are finite (masked)."""
         for name, image in (("test", test), ("reference", reference)):
             if image.ndim != 4 or image.shape[1] != 3 or 0 in image.shape:
                 raise ValueError(
-                    f"expected a {name} of shape (B, 3, H, W), got {tuple(image.shape)}"
+                    f"expected a {name} of shape (B, 3, H, W) with no side of 0, "
+                    f"got {tuple(image.shape)}"
                 )
             if not image.is_floating_point():
                 raise ValueError(
@@ -359,7 +373,12 @@ class VDM(nn.Module):
             )
         double = torch.float64 in (test.dtype, reference.dtype)
         dtype = torch.float64 if double else torch.float32
-        test, reference = _widened(test, dtype), _widened(reference, dtype)
+        # In one layout: a tensor in another takes other paths through the vectorised loops, and
+        # equal images would differ in their last bits.
+        test, reference = (
+            _widened(test, dtype).contiguous(),
+            _widened(reference, dtype).contiguous(),
+        )
         if self.nonfinite == "mask":
             seen = (torch.isfinite(test) & torch.isfinite(reference)).all(1, keepdim=True)
             return torch.where(seen, test, 0.0), torch.where(seen, reference, 0.0), seen
@@ -470,12 +489,16 @@ class _Widen(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, _: None) -> Tensor:
+        return tangent.to(ctx.wide)
+
+    @staticmethod
     def forward(image: Tensor, dtype: torch.dtype) -> Tensor:
         return image.to(dtype)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, torch.dtype], _: Tensor) -> None:
-        ctx.dtype = inputs[0].dtype
+        ctx.dtype, ctx.wide = inputs[0].dtype, inputs[1]
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
@@ -485,14 +508,10 @@ class _Widen(torch.autograd.Function):
 
 def _widened(image: Tensor, dtype: torch.dtype) -> Tensor:
     """Return an image in ``dtype``, which holds at least as much as its own."""
-    widened: Tensor = image if image.dtype == dtype else _Widen.apply(image, dtype)
+    if image.dtype not in (torch.float16, torch.bfloat16):
+        return image.to(dtype)
+    widened: Tensor = _Widen.apply(image, dtype)
     return widened
-
-
-def _items(batch: Tensor) -> Iterator[Tensor]:
-    """Yield the items of a batch as tensors of their own, (1, ...)."""
-    # A view's offset would be one more thing that compiled code is specialised on.
-    return (item.clone() for item in batch.split(1)) if len(batch) > 1 else iter([batch])
 
 
 def _masked(plane: Tensor, seen: Tensor | None) -> Tensor:

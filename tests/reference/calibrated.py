@@ -291,8 +291,10 @@ def lowpass_term(
     float
         JND to the power ``summation_exponent``.
     """
+    # The last lowpass is the cone image. Its plain mean: in the root's own node the repeated
+    # border of an odd side would count for more than it is.
     contrast = lowpass_contrast(
-        test.lowpass[0][:, 0, 0], reference.lowpass[0][:, 0, 0], parameters.dark_light
+        test.lowpass[-1].mean((1, 2)), reference.lowpass[-1].mean((1, 2)), parameters.dark_light
     )
     opponent = opponents(contrast[None, :, None, None], effects)[0, :, 0, 0]
     term = 0.0

@@ -24,6 +24,7 @@ class Haar:
         Cortex
             ``details[l]`` is (B, C, 3, h, w): d1 (horizontal), d2 (vertical), d3 (diagonal).
         """
+        mean = planes.mean((-2, -1), keepdim=True)
         details: list[Tensor] = []
         lowpass: list[Tensor] = []
         while max(planes.shape[-2:]) > 1:
@@ -31,7 +32,7 @@ class Haar:
             planes, detail = step(pad_even(planes))
             details.append(detail)
             lowpass.append(planes)
-        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [planes])))
+        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [planes])), mean)
 
     def peak(self, level_from_finest: int) -> tuple[float, float]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there."""

@@ -15,10 +15,14 @@ class Cortex(NamedTuple):
     lowpass
         One tensor a level, (B, cones, h, w): the lowpass coefficients of the same nodes. An
         image of one pixel has no details and one lowpass, itself.
+    mean
+        (B, cones, 1, 1), the mean of the image. Not the root's lowpass, in which the repeated
+        border of an odd side counts for more than it is.
     """
 
     details: tuple[Tensor, ...]
     lowpass: tuple[Tensor, ...]
+    mean: Tensor
 
     def parent_lowpass(self, level: int) -> Tensor:
         """Return the lowpass one level up from ``level``; the root's is its own."""

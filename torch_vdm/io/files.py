@@ -240,7 +240,9 @@ def _load(
         else:
             pixels = load_png(data, notes) if content == "PNG" else load_jpeg(data, notes)
     sentences = tuple(printable(note) for note in notes)
-    return Image(torch.from_numpy(np.ascontiguousarray(pixels)), content == "OpenEXR", sentences)
+    return Image(
+        torch.from_numpy(np.array(pixels, np.float32, order="C")), content == "OpenEXR", sentences
+    )
 
 
 def _read(path: PathLike) -> bytes:
