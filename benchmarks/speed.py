@@ -249,6 +249,10 @@ def _plot(result: dict[str, Any], path: Path) -> None:
             points.append((wide * high / 1e6, 1e9 * seconds[name] / (wide * high)))
         curve.plot(*zip(*points, strict=True), marker="o", label=name)
     curve.set_xscale("log")
+    sizes = list(result["forward_seconds_by_size"])
+    areas = [math.prod(map(int, size.split("x"))) / 1e6 for size in sizes]
+    curve.set_xticks(areas, labels=[f"{area:.2g}" for area in areas])
+    curve.minorticks_off()
     curve.set_ylim(bottom=0.0)
     curve.set_xlabel("megapixels")
     curve.set_ylabel("nanoseconds a pixel")
