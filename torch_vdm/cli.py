@@ -25,7 +25,7 @@ from torch_vdm.display import (
     encode_srgb,
     pixels_per_degree,
 )
-from torch_vdm.io import ImageError, atomic_path, load, write_image
+from torch_vdm.io import ImageError, atomic_path, check_target, load, write_image
 from torch_vdm.observer import Observer
 from torch_vdm.report import Comparison, figures, table, write_heat_map
 from torch_vdm.vdm import VDM
@@ -228,8 +228,7 @@ def _check_outputs(inputs: tuple[Path, Path], options: argparse.Namespace) -> No
                 f"{path}: expected a file of its own to write to, got {taken[target]} again; "
                 "choose another name"
             )
-        if not target.parent.is_dir():
-            raise _UsageError(f"{path}: expected the folder to exist; create it first")
+        check_target(target)
         taken[target] = path
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_vdm.display import Display
-from torch_vdm.vdm import VDM
+from torch_vdm.vdm import VDM, finite_in_both
 
 Reduction = Literal["mean", "sum", "none"]
 
@@ -71,8 +71,7 @@ class VDMLoss(nn.Module):
         plane = torch.log1p(self.metric.power(test, reference))
         if self.l1:
             if self.metric.nonfinite == "mask":
-                seen = (torch.isfinite(test) & torch.isfinite(reference)).all(1, keepdim=True)
-                test, reference = torch.where(seen, test, 0.0), torch.where(seen, reference, 0.0)
+                test, reference, _ = finite_in_both(test, reference)
             difference = self._coded(test, plane.dtype) - self._coded(reference, plane.dtype)
             plane = plane + self.l1 * difference.abs().mean(1, keepdim=True)
         items = _mean(plane, mask)

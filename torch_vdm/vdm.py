@@ -140,7 +140,7 @@ class VDM(nn.Module):
     def _apply(self, fn: Any, recurse: bool = True) -> Self:
         """Move the constants with the module, but never to a lower precision."""
         exact = dict(self._buffers)
-        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]  # torch's own, without types
         for name, moved in self._buffers.items():
             constant = exact[name]
             if moved is not None and constant is not None and moved.dtype != constant.dtype:
@@ -284,22 +284,19 @@ class VDM(nn.Module):
             self.effects.masking,
         )
         exponent = constants["summation_exponent"]
-        if self._fast and details[0].numel() >= SMALLEST:
-            difference = compiled(_response_difference)(*details, *around)
-            if self.effects.pooling:
-                local_difference: Tensor = compiled(_pooled_difference)(
-                    surround(difference), exponent
-                )
-                return local_difference
-            return local_visual_difference(difference, exponent)
+        size = details[0].numel()
+        fast = self._fast and size >= SMALLEST
+        respond = compiled(_response_difference) if fast else _response_difference
+        gather = compiled(_pooled_difference) if fast else _pooled_difference
         # One orientation at a time where the planes are large: what is computed on the way then
-        # stays in the processor's cache.
-        step = 1 if details[0].numel() > LARGEST_AT_ONCE else details[0].shape[2]
+        # stays in the processor's cache. Compiled code keeps nothing on the way.
+        at_once = fast or size <= LARGEST_AT_ONCE
+        parts = [details] if at_once else zip(*(d.split(1, 2) for d in details), strict=True)
         local: list[Tensor] = []
-        for one, other in zip(*(detail.split(step, 2) for detail in details), strict=True):
-            difference = _response_difference(one, other, *around)
+        for one, other in parts:
+            difference = respond(one, other, *around)
             if self.effects.pooling:
-                local.append(_pooled_difference(surround(difference), exponent))
+                local.append(gather(surround(difference), exponent))
             else:
                 local.append(local_visual_difference(difference, exponent))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]
@@ -380,12 +377,20 @@ class VDM(nn.Module):
             _widened(reference, dtype).contiguous(),
         )
         if self.nonfinite == "mask":
-            seen = (torch.isfinite(test) & torch.isfinite(reference)).all(1, keepdim=True)
-            return torch.where(seen, test, 0.0), torch.where(seen, reference, 0.0), seen
+            return finite_in_both(test, reference)
         if not torch.compiler.is_compiling():
             _require_finite("test", test)
             _require_finite("reference", reference)
         return test, reference, None
+
+
+def finite_in_both(test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return both images with 0 where a channel of either is not finite, and where all are.
+
+    (B, 3, H, W) twice, and (B, 1, H, W), boolean.
+    """
+    seen = (torch.isfinite(test) & torch.isfinite(reference)).all(1, keepdim=True)
+    return torch.where(seen, test, 0.0), torch.where(seen, reference, 0.0), seen
 
 
 def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) -> Tensor:

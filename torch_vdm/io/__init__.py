@@ -1,6 +1,21 @@
 """Images from files and to files: OpenEXR, PNG and JPEG."""
 
-from torch_vdm.io.files import Image, atomic_path, load, read_image, write_image
+from torch_vdm.io.files import (
+    Image,
+    atomic_path,
+    check_target,
+    load,
+    read_image,
+    write_image,
+)
 from torch_vdm.io.refusal import ImageError
 
-__all__ = ["Image", "ImageError", "atomic_path", "load", "read_image", "write_image"]
+__all__ = [
+    "Image",
+    "ImageError",
+    "atomic_path",
+    "check_target",
+    "load",
+    "read_image",
+    "write_image",
+]

@@ -204,7 +204,7 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
     temporary = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
     ours = {str(name) for name in (None, temporary, target, target.parent)}
     try:
-        _check_target(target)
+        check_target(target)
         yield temporary
         temporary.replace(target)
     except OSError as error:
@@ -217,7 +217,8 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def _check_target(target: Path) -> None:
+def check_target(target: Path) -> None:
+    """Refuse what `atomic_path` could not put a file in the place of."""
     if not target.parent.is_dir():
         raise ImageError(f"{target}: expected the folder to exist; create it first")
     # Renaming over a folder fails, and over a device such as /dev/null replaces the device.
