@@ -7,7 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from torch_vdm.display import Display
-from torch_vdm.vdm import VDM, finite_in_both
+from torch_vdm.pair import finite_in_both
+from torch_vdm.vdm import VDM
 
 Reduction = Literal["mean", "sum", "none"]
 

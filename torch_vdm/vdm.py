@@ -1,10 +1,9 @@
 """The visual difference metric: the stages of Fig. 2, in order. Only this file knows the order."""
 
-from collections.abc import Iterator
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torch_vdm.aberration import attenuation
 from torch_vdm.cones import XYZ_TO_SML, cone_responses
@@ -24,10 +23,10 @@ from torch_vdm.fast import SMALLEST, compiled
 from torch_vdm.masking import energy_transducer, signed_transducer
 from torch_vdm.matrix import mix
 from torch_vdm.observer import Observer
+from torch_vdm.pair import Nonfinite, PairMetric
 from torch_vdm.pooling import pool, surround
 from torch_vdm.quadtree import push
-
-Nonfinite = Literal["raise", "mask"]
+from torch_vdm.sarnoff import Sarnoff
 
 # Levels that the constants are made for: an image of 2^24 pixels a side.
 DEEPEST = 24
@@ -45,7 +44,7 @@ class Level(NamedTuple):
     """0-dim: what its contrast is divided by."""
 
 
-class VDM(nn.Module):
+class VDM(PairMetric):
     """The visual difference metric of Bolin and Meyer 1999 as a module.
 
     Calling it with a test and a reference image, both (B, 3, H, W), gives the map of their
@@ -87,25 +86,16 @@ class VDM(nn.Module):
         effects: Effects | None = None,
         nonfinite: Nonfinite = "raise",
     ) -> None:
-        super().__init__()
-        if not 0.01 <= ppd <= 1e6:
-            raise ValueError(f"expected pixels per degree between 0.01 and 1e6, got {ppd}")
+        super().__init__(ppd, display, nonfinite)
         for name, option, kind in (
-            ("display", display, Display),
             ("observer", observer, Observer),
             ("effects", effects, Effects),
         ):
             if not isinstance(option, kind | None):
                 raise ValueError(f"expected {name}: {kind.__name__}, got {option!r}")
-        if nonfinite not in ("raise", "mask"):
-            raise ValueError(f'expected nonfinite "raise" or "mask", got {nonfinite!r}')
-        self.ppd = float(ppd)
-        self.display = display or Display.srgb()
         self.observer = observer or Observer.calibrated()
         self.transform = transform or Haar()
         self.effects = effects or Effects()
-        self.nonfinite = nonfinite
-        self._fast = False
 
         peaks = [self.transform.peak(level) for level in range(DEEPEST)]
         cones = torch.tensor(XYZ_TO_SML, dtype=torch.float64)
@@ -130,6 +120,11 @@ class VDM(nn.Module):
         """Return the metric with the paper's observer, every equation as printed."""
         return cls(ppd, display, observer=Observer.paper(), **options)
 
+    @staticmethod
+    def sarnoff(ppd: float = 60.0, display: Display | None = None, **options: Any) -> Sarnoff:
+        """Return the model that the paper simplifies: Lubin 1995, of luminance alone."""
+        return Sarnoff(ppd, display, **options)
+
     def extra_repr(self) -> str:
         """Return the options."""
         return (
@@ -137,53 +132,11 @@ class VDM(nn.Module):
             f"transform={self.transform}, effects={self.effects.names()}"
         )
 
-    def _apply(self, fn: Any, recurse: bool = True) -> Self:
-        """Move the constants with the module, but never to a lower precision."""
-        exact = dict(self._buffers)
-        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]  # torch's own, without types
-        for name, moved in self._buffers.items():
-            constant = exact[name]
-            if moved is not None and constant is not None and moved.dtype != constant.dtype:
-                self._buffers[name] = constant.to(moved.device)
-        return self
+    def _accumulated(self, test: Tensor, reference: Tensor) -> Tensor:
+        return self.compare(self.represent(test), self.represent(reference))
 
-    def compile(self, *args: Any, **kwargs: Any) -> Self:  # type: ignore[override]
-        """Switch to the fast route: one compiled function a level, for any size and batch.
-
-        Unlike ``torch.compile(metric)``, which compiles the graph of all levels anew for each
-        size. Takes no arguments; returns the module itself, where `nn.Module.compile` returns
-        nothing. Needs a C++ compiler.
-        """
-        if args or kwargs:
-            raise ValueError("expected no arguments: the fast route has no options")
-        self._fast = True
-        return self
-
-    def forward(self, test: Tensor, reference: Tensor) -> Tensor:
-        """Return the map of visible differences.
-
-        Parameters
-        ----------
-        test, reference
-            (B, 3, H, W), floating point, as the display expects them.
-
-        Returns
-        -------
-        Tensor
-            (B, 1, H, W), JND.
-        """
-        total, seen = self._total(test, reference)
-        jnd = just_noticeable(total, self._constants(total.dtype)["summation_exponent"])
-        return _masked(push(jnd, (test.shape[-2], test.shape[-1])), seen)
-
-    def power(self, test: Tensor, reference: Tensor) -> Tensor:
-        """Return the accumulated differences before the root: the map to the power of 2.4.
-
-        (B, 1, H, W), from (B, 3, H, W) twice. Smooth where the images are equal, so that a loss
-        is taken from here; see `VDMLoss`.
-        """
-        total, seen = self._total(test, reference)
-        return _masked(push(total, (test.shape[-2], test.shape[-1])), seen)
+    def _to_pixels(self, plane: Tensor, size: tuple[int, int]) -> Tensor:
+        return push(plane, size)
 
     def score(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the detection score of each item, (B,), JND: the image as one stimulus.
@@ -328,71 +281,6 @@ class VDM(nn.Module):
         # Copies, for compiled code is specialised on the offset of a view.
         return [Level(frequencies[n].clone(), gains[n].clone()) for n in reversed(range(count))]
 
-    def _constants(self, dtype: torch.dtype) -> dict[str, Tensor]:
-        """Return the constants in the precision of the computation."""
-        return {name: value.to(dtype) for name, value in self.named_buffers()}
-
-    def _total(self, test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor | None]:
-        test, reference, seen = self._checked(test, reference)
-        totals = [
-            self.compare(self.represent(one), self.represent(other))
-            for one, other in self._parts(test, reference)
-        ]
-        return torch.cat(totals), seen
-
-    def _parts(self, test: Tensor, reference: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield both batches, whole or, on the fast route, item by item."""
-        if not self._fast or len(test) == 1:
-            return iter([(test, reference)])
-        # A compiled function is specialised on a batch of one and on the offset of a view.
-        return (
-            (one.clone(), other.clone())
-            for one, other in zip(test.split(1), reference.split(1), strict=True)
-        )
-
-    def _checked(self, test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return both images in the computing precision, and where they are finite (masked)."""
-        for name, image in (("test", test), ("reference", reference)):
-            if image.ndim != 4 or image.shape[1] != 3 or 0 in image.shape:
-                raise ValueError(
-                    f"expected a {name} of shape (B, 3, H, W) with no side of 0, "
-                    f"got {tuple(image.shape)}"
-                )
-            if not image.is_floating_point():
-                raise ValueError(
-                    f"expected a {name} of floating point, got {image.dtype}; "
-                    "divide 8-bit values by 255"
-                )
-        if test.shape != reference.shape:
-            raise ValueError(
-                "expected two images of one shape, "
-                f"got {tuple(test.shape)} and {tuple(reference.shape)}"
-            )
-        double = torch.float64 in (test.dtype, reference.dtype)
-        dtype = torch.float64 if double else torch.float32
-        # In one layout: a tensor in another takes other paths through the vectorised loops, and
-        # equal images would differ in their last bits.
-        test, reference = (
-            _widened(test, dtype).contiguous(),
-            _widened(reference, dtype).contiguous(),
-        )
-        if self.nonfinite == "mask":
-            return finite_in_both(test, reference)
-        if not torch.compiler.is_compiling():
-            _require_finite("test", test)
-            _require_finite("reference", reference)
-        return test, reference, None
-
-
-def finite_in_both(test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return both images with 0 where a channel of either is not finite, and where all are.
-
-    (B, 3, H, W) twice, and (B, 1, H, W), boolean.
-    """
-    seen = (torch.isfinite(test) & torch.isfinite(reference)).all(1, keepdim=True)
-    return torch.where(seen, test, 0.0), torch.where(seen, reference, 0.0), seen
-
-
 def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) -> Tensor:
     """Return the cone responses (B, 3, H, W) to an image on a display."""
     return cone_responses(display.to_xyz(image, primaries), cones)
@@ -486,55 +374,3 @@ def _pooled_difference(surrounded: Tensor, exponent: Tensor) -> Tensor:
     absolute difference, for neighbours alternate and would cancel.
     """
     return local_visual_difference(pool(surrounded), exponent)
-
-
-class _Widen(torch.autograd.Function):
-    """A cast to more bits whose gradient saturates on the way back instead of overflowing."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor, _: None) -> Tensor:
-        return tangent.to(ctx.wide)
-
-    @staticmethod
-    def forward(image: Tensor, dtype: torch.dtype) -> Tensor:
-        return image.to(dtype)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, torch.dtype], _: Tensor) -> None:
-        ctx.dtype, ctx.wide = inputs[0].dtype, inputs[1]
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        largest = torch.finfo(ctx.dtype).max
-        return gradient.clamp(-largest, largest).to(ctx.dtype), None
-
-
-def _widened(image: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return an image in ``dtype``, which holds at least as much as its own."""
-    if image.dtype not in (torch.float16, torch.bfloat16):
-        return image.to(dtype)
-    widened: Tensor = _Widen.apply(image, dtype)
-    return widened
-
-
-def _masked(plane: Tensor, seen: Tensor | None) -> Tensor:
-    return plane if seen is None else torch.where(seen, plane, 0.0)
-
-
-def _require_finite(name: str, image: Tensor) -> None:
-    """Raise where ``image`` has NaN or infinity, naming the first such item and pixel."""
-    # One cheap pass: the sum of an image that is not finite is not.
-    if bool(torch.isfinite(image.detach().sum())):
-        return
-    bad = ~torch.isfinite(image.detach())
-    if not bool(bad.any()):
-        return
-    item = int(bad.flatten(1).any(1).nonzero()[0])
-    channel, y, x = bad[item].nonzero()[0].tolist()
-    raise ValueError(
-        f"expected finite pixel values, got {int(bad[item].sum())} NaN or infinite ones in the "
-        f"{name}'s batch item {item}, the first in channel {channel} at x {x}, y {y}; "
-        'repair them or pass nonfinite="mask"'
-    )
