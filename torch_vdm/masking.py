@@ -6,13 +6,20 @@ from torch import Tensor
 # Eq. 4 of Bolin and Meyer 1999, T(A) = 2 A^(2.25/2) / (A^(2.05/2) + 1). Status: printed.
 GAIN, NUMERATOR, DENOMINATOR = 2.0, 2.25 / 2.0, 2.05 / 2.0
 
+# Below this the output is 0 in float32. Status: choice.
+SMALLEST_ENERGY = 1e-35
+
 
 def energy_transducer(energy: Tensor) -> Tensor:
     """Return T(A) of Eq. 4; A is the energy (contrast x sensitivity)^2, T(1) = 1.
 
     The sign of a detail is lost in the energy, and the slope at 0 is 0.
     """
-    return GAIN * energy**NUMERATOR / (energy**DENOMINATOR + 1.0)
+    # Powers as the energy times what is left of it, in the processor's own base 2, as in
+    # `local_visual_difference`: one logarithm for both.
+    octaves = torch.log2(energy.clamp_min(SMALLEST_ENERGY))
+    numerator = energy * torch.exp2((NUMERATOR - 1.0) * octaves)
+    return GAIN * numerator / (energy * torch.exp2((DENOMINATOR - 1.0) * octaves) + 1.0)
 
 
 def signed_transducer(contrast: Tensor, exponent: Tensor) -> Tensor:
