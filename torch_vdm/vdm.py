@@ -281,6 +281,7 @@ class VDM(PairMetric):
         # Copies, for compiled code is specialised on the offset of a view.
         return [Level(frequencies[n].clone(), gains[n].clone()) for n in reversed(range(count))]
 
+
 def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) -> Tensor:
     """Return the cone responses (B, 3, H, W) to an image on a display."""
     return cone_responses(display.to_xyz(image, primaries), cones)
