@@ -1,10 +1,10 @@
 """The Sarnoff visual discrimination model of Lubin 1995: what the paper's metric simplifies.
 
 J. Lubin, A Visual Discrimination Model for Imaging System Design and Evaluation (in E. Peli, ed.,
-Vision Models for Target Detection and Recognition, World Scientific 1995, pp. 245-283). Its chapter
-was not at hand: what is marked "recalled" is from memory, see docs/model.md. Achromatic; all filters
-are separable and written as additions of slices, which is faster here than a convolution, and stays
-in full precision under autocast and TF32.
+Vision Models for Target Detection and Recognition, World Scientific 1995, pp. 245-283). The
+chapter was not at hand: what is marked "recalled" is from memory, see docs/model.md. Achromatic.
+All filters are separable and written as additions of slices, which is faster here than a
+convolution, and stays in full precision under autocast and TF32.
 """
 
 import math
@@ -24,7 +24,7 @@ from torch_vdm.pair import Nonfinite, PairMetric
 
 # Line spread of the eye, the sum of weight exp(-decay x^2) and weight exp(-decay abs(x)), x in
 # minutes of arc. Source: Westheimer 1986. Status: source. Beyond RADIUS it is under 1/1000 of its
-# peak: choice. It is applied along rows and columns, which is exact for gratings along them: choice.
+# peak. It is applied along rows and columns, which is exact for gratings along them. Status: choice.
 GAUSSIAN_WEIGHT, GAUSSIAN_DECAY = 0.47, 3.3
 EXPONENTIAL_WEIGHT, EXPONENTIAL_DECAY = 0.53, 0.93
 RADIUS = 7.0
@@ -32,7 +32,7 @@ RADIUS = 7.0
 # Pixels per degree of the cone mosaic that images are resampled to. Status: recalled.
 MOSAIC = 120.0
 
-# The pyramid: octaves, and the weights of Burt and Adelson 1983 (a = 3/8). Status: recalled; source.
+# The pyramid's octaves. Status: recalled. Its weights, Burt and Adelson 1983. Status: source.
 OCTAVES = 7
 CENTRE, NEXT, OUTER = 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0
 
@@ -49,7 +49,7 @@ H2_LINEAR, H2_CROSSED = 2.254, 0.7515
 # paper's observer. The eye's own light, which only keeps a division by 0 finite. Status: choice.
 ADAPTATION, SIZE, DARK_LIGHT = 100.0, 12.0, 1e-4
 
-# Contrasts are held to this, so that powers of values that are no light stay finite. Status: choice.
+# Contrasts are held to this: values that are no light have no bound. Status: choice.
 LARGEST = 1e10
 
 # Exponent of the distance summation. Status: recalled, and printed in Eq. 5 of the paper.
@@ -173,7 +173,7 @@ class Sarnoff(PairMetric):
         for octave in reversed(range(OCTAVES)):
             sensitivity = sensitivities[octave].clone()
             contrasts = [self._contrast(*planes[octave : octave + 3]) for planes in (first, second)]
-            local = self._local_difference(*contrasts, sensitivity)
+            local = self._local_difference(contrasts[0], contrasts[1], sensitivity)
             total = local if total is None else local + self._expanded(total, local)
         assert total is not None
         return total

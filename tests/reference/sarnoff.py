@@ -71,10 +71,10 @@ def interpolated(line: Array, size: int, cubic: bool) -> Array:
     return result
 
 
-def resampled(plane: Array, height: int, width: int, cubic: bool) -> Array:
+def resampled(plane: Array, size: tuple[int, ...], cubic: bool) -> Array:
     """Return a plane at another size."""
-    wide = np.stack([interpolated(row, width, cubic) for row in plane])
-    return np.stack([interpolated(column, height, cubic) for column in wide.T]).T
+    wide = np.stack([interpolated(row, size[1], cubic) for row in plane])
+    return np.stack([interpolated(column, size[0], cubic) for column in wide.T]).T
 
 
 def reduced(plane: Array) -> Array:
@@ -155,8 +155,8 @@ def pooled(luminance: Array, ppd: float, resample: bool) -> list[list[Array]]:
     """Return the pooled responses of one image: per octave, per orientation."""
     retina = optics(luminance, ppd)
     if resample:
-        height, width = (max(1, round(side * GRID_PPD / ppd)) for side in retina.shape)
-        retina = resampled(retina, height, width, cubic=True)
+        size = tuple(max(1, round(side * GRID_PPD / ppd)) for side in retina.shape)
+        retina = resampled(retina, size, cubic=True)
     responses = []
     for octave, contrast in enumerate(contrasts(retina)):
         weight = sensitivity(octave, ppd, resample)
@@ -180,5 +180,5 @@ def jnd_map(test: Array, reference: Array, ppd: float, resample: bool) -> Array:
             total = total + np.abs(one - other) ** EXPONENT
     jnd = total ** (1.0 / EXPONENT)
     if resample and jnd.shape != test.shape:
-        jnd = resampled(jnd, *test.shape, cubic=False)
+        jnd = resampled(jnd, test.shape, cubic=False)
     return np.asarray(jnd)
