@@ -2,29 +2,27 @@
 
 J. Lubin, A Visual Discrimination Model for Imaging System Design and Evaluation (in E. Peli, ed.,
 Vision Models for Target Detection and Recognition, World Scientific 1995, pp. 245-283). The
-chapter was not at hand: what is marked "recalled" is from memory, see docs/model.md. Achromatic.
-All filters are separable and written as additions of slices, which is faster here than a
-convolution, and stays in full precision under autocast and TF32.
+chapter was not at hand: what is marked "recalled" is from memory, see docs/model.md.
 """
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torch_vdm.cortex import oriented
+from torch_vdm.cortex.gaussian import along, expand, lowpass_response, reduce, response, step
 from torch_vdm.csf import barten
 from torch_vdm.display import BT709_TO_XYZ, Display
 from torch_vdm.distance import local_visual_difference
-from torch_vdm.fast import SMALLEST, compiled
+from torch_vdm.fast import SMALLEST
 from torch_vdm.masking import energy_transducer
 from torch_vdm.pair import Nonfinite, PairMetric
 
 # Line spread of the eye, the sum of weight exp(-decay x^2) and weight exp(-decay abs(x)), x in
 # minutes of arc. Source: Westheimer 1986. Status: source. Beyond RADIUS it is under 1/1000 of its
-# peak. It is applied along rows and columns, which is exact for gratings along them. Status: choice.
+# peak. Applied along rows and columns, which is exact for gratings along them. Status: choice.
 GAUSSIAN_WEIGHT, GAUSSIAN_DECAY = 0.47, 3.3
 EXPONENTIAL_WEIGHT, EXPONENTIAL_DECAY = 0.53, 0.93
 RADIUS = 7.0
@@ -32,18 +30,12 @@ RADIUS = 7.0
 # Pixels per degree of the cone mosaic that images are resampled to. Status: recalled.
 MOSAIC = 120.0
 
-# The pyramid's octaves. Status: recalled. Its weights, Burt and Adelson 1983. Status: source.
+# Octaves of the pyramid. Status: recalled.
 OCTAVES = 7
-CENTRE, NEXT, OUTER = 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0
 
 # Frequency of a band in cycles per sample: 32 cycles/degree on the finest of the mosaic. Status:
 # recalled (32, 16 ... 0.5 cycles/degree).
 BAND = 32.0 / 120.0
-
-# The second derivative of a Gaussian and its Hilbert transform, Freeman and Adelson 1991, tables III
-# to VI, 9 taps. Their gains are set by `_gain`. Status: source.
-SPACING, TAPS = 0.67, 9
-H2_LINEAR, H2_CROSSED = 2.254, 0.7515
 
 # What the eye is adapted to, in cd/m2, and the size of Barten's target, in degrees: those of the
 # paper's observer. The eye's own light, which only keeps a division by 0 finite. Status: choice.
@@ -59,35 +51,9 @@ EXPONENT = 2.4
 # Status: choice, measured.
 LARGEST_AT_ONCE = 2**17
 
-
-def _derivatives() -> tuple[tuple[float, ...], ...]:
-    """Return the one-dimensional filters, TAPS each: those that the basis filters are products of.
-
-    The Gaussian, x and (2 x^2 - 1), (x^3 - 2.254 x) and (x^2 - 0.7515) times it.
-    """
-    x = [SPACING * (tap - TAPS // 2) for tap in range(TAPS)]
-    return (
-        tuple(math.exp(-u * u) for u in x),
-        tuple(u * math.exp(-u * u) for u in x),
-        tuple((2.0 * u * u - 1.0) * math.exp(-u * u) for u in x),
-        tuple((u**3 - H2_LINEAR * u) * math.exp(-u * u) for u in x),
-        tuple((u * u - H2_CROSSED) * math.exp(-u * u) for u in x),
-    )
-
-
-GAUSSIAN, FIRST, SECOND, THIRD, CROSSED = _derivatives()
-
-
-def _gain(derivative: tuple[float, ...], frequency: float) -> float:
-    """Return what a filter across a grating and the Gaussian along it leave of its amplitude."""
-    phases = [2.0 * math.pi * frequency * (tap - TAPS // 2) for tap in range(TAPS)]
-    even = sum(w * math.cos(phase) for w, phase in zip(derivative, phases, strict=True))
-    odd = sum(w * math.sin(phase) for w, phase in zip(derivative, phases, strict=True))
-    return math.hypot(even, odd) * sum(GAUSSIAN)
-
-
-# Of both filters at a band's own frequency, so that a grating of it has no phase in the energy.
-EVEN_GAIN, ODD_GAIN = _gain(SECOND, BAND), _gain(THIRD, BAND)
+# Of the oriented filters at a band's own frequency, so that a grating of it has no phase in the
+# energy.
+EVEN_GAIN, ODD_GAIN = oriented.even_gain(BAND), oriented.odd_gain(BAND)
 
 
 class Sarnoff(PairMetric):
@@ -158,10 +124,10 @@ class Sarnoff(PairMetric):
         weights = []
         for octave, frequency in enumerate(self.frequencies):
             cycles = min(frequency / self.ppd, 0.5)  # nothing is finer than a pixel
-            passed = _response(self._spread, cycles) / _response(self._spread, 0.0)
+            passed = response(self._spread, cycles)
             for finer in range(octave):
-                passed *= _lowpass_response(BAND / 2.0 ** (octave - finer))
-            passed *= 1.0 - _lowpass_response(BAND) ** 2
+                passed *= lowpass_response(BAND / 2.0 ** (octave - finer))
+            passed *= 1.0 - lowpass_response(BAND) ** 2
             sensitivity = barten(torch.tensor(frequency, dtype=torch.float64), luminance, size)
             weights.append(float(sensitivity) / passed)
         return weights
@@ -174,17 +140,20 @@ class Sarnoff(PairMetric):
             sensitivity = sensitivities[octave].clone()
             contrasts = [self._contrast(*planes[octave : octave + 3]) for planes in (first, second)]
             local = self._local_difference(contrasts[0], contrasts[1], sensitivity)
-            total = local if total is None else local + self._expanded(total, local)
+            if total is not None:
+                size = (local.shape[-2], local.shape[-1])
+                local = local + expand(total, size, self._fast)
+            total = local
         assert total is not None
         return total
 
     def _local_difference(self, first: Tensor, second: Tensor, sensitivity: Tensor) -> Tensor:
         """Return the local visual difference (B, 1, h, w) of two contrast planes of a band."""
         exponent = self._constants(first.dtype)["summation_exponent"]
-        across = self._compiled(_across, first)
-        difference = self._compiled(_response_difference, first)
-        gather = self._compiled(_pooled_difference, first)
-        halo = TAPS // 2
+        filtered = step(oriented.across, first, self._fast)
+        difference = step(_response_difference, first, self._fast)
+        gather = step(_pooled_difference, first, self._fast)
+        halo = oriented.REACH
         padded = [_surround(plane, halo) for plane in (first, second)]
         height = first.shape[-2]
         fast = self._fast and first.numel() >= SMALLEST
@@ -192,42 +161,33 @@ class Sarnoff(PairMetric):
         parts = []
         for top in range(0, height, rows):
             end = min(top + rows, height) + 2 * halo
-            one, other = (across(plane[..., top:end, :]) for plane in padded)
+            one, other = (filtered(plane[..., top:end, :]) for plane in padded)
             parts.append(difference(one, other, sensitivity))
         local: Tensor = gather(torch.cat(parts, -2) if len(parts) > 1 else parts[0], exponent)
         return local
 
     def _contrast(self, plane: Tensor, lower: Tensor, lowest: Tensor) -> Tensor:
         """Return the local contrast: a Laplacian band over the lowpass two levels down."""
-        around = self._expanded(self._expanded(lowest, lower), plane)
-        contrast: Tensor = self._compiled(_divided, plane)(
-            plane, self._expanded(lower, plane), around
-        )
+        size = (plane.shape[-2], plane.shape[-1])
+        around = expand(lowest, (lower.shape[-2], lower.shape[-1]), self._fast)
+        around = expand(around, size, self._fast)
+        lowpass = expand(lower, size, self._fast)
+        contrast: Tensor = step(_divided, plane, self._fast)(plane, lowpass, around)
         return contrast
-
-    def _expanded(self, plane: Tensor, finer: Tensor) -> Tensor:
-        """Return a plane at the size of the next finer one."""
-        wide = self._compiled(_doubled_along_rows, finer)(plane, finer.shape[-1])
-        whole: Tensor = self._compiled(_doubled_along_columns, finer)(wide, finer.shape[-2])
-        return whole
 
     def _pyramid(self, image: Tensor) -> list[Tensor]:
         """Return the lowpass planes of the luminance after the optics, the finest first."""
         matrix = self._constants(image.dtype)["luminance"]
-        plane = self._compiled(_luminance, image)(image, self.display, matrix)
+        plane = step(_luminance, image, self._fast)(image, self.display, matrix)
         for blur in (_blurred_along_rows, _blurred_along_columns):
-            plane = self._compiled(blur, plane)(plane, self._spread)
+            plane = step(blur, plane, self._fast)(plane, self._spread)
         if self.resample:
             size = [max(1, round(side * MOSAIC / self.ppd)) for side in plane.shape[-2:]]
             plane = functional.interpolate(plane, size, mode="bicubic", antialias=True)
         planes = [plane]
         for _ in range(OCTAVES + 1):
-            half = self._compiled(_halved_along_rows, planes[-1])(planes[-1])
-            planes.append(self._compiled(_halved_along_columns, planes[-1])(half))
+            planes.append(reduce(planes[-1], self._fast))
         return planes
-
-    def _compiled(self, function: Callable[..., Any], plane: Tensor) -> Callable[..., Any]:
-        return compiled(function) if self._fast and plane.numel() >= SMALLEST else function
 
     def _to_pixels(self, plane: Tensor, size: tuple[int, int]) -> Tensor:
         if not self.resample or plane.shape[-2:] == size:
@@ -248,20 +208,6 @@ def _line_spread(ppd: float) -> tuple[float, ...]:
     return tuple(weight / sum(spread) for weight in spread)
 
 
-def _response(spread: tuple[float, ...], frequency: float) -> float:
-    """Return what symmetric weights leave of a grating, in cycles/pixel."""
-    centre = len(spread) // 2
-    return sum(
-        weight * math.cos(2.0 * math.pi * frequency * (tap - centre))
-        for tap, weight in enumerate(spread)
-    )
-
-
-def _lowpass_response(frequency: float) -> float:
-    """Return what the pyramid's lowpass leaves of a grating, in cycles/sample."""
-    return _response((OUTER, NEXT, CENTRE, NEXT, OUTER), frequency)
-
-
 def _luminance(image: Tensor, display: Display, matrix: Tensor) -> Tensor:
     """Return the luminance (B, 1, H, W), cd/m2, of an image on a display."""
     light = display.to_xyz(image, matrix)
@@ -273,66 +219,16 @@ def _surround(plane: Tensor, width: int) -> Tensor:
     return functional.pad(plane, (width, width, width, width), mode="replicate")
 
 
-def _along(plane: Tensor, weights: tuple[float, ...], dim: int) -> Tensor:
-    """Correlate with even or odd weights along ``dim``, which shortens by their number less one.
-
-    Taps of equal size are added, or subtracted, before they are weighted.
-    """
-    last = len(weights) - 1
-    centre = last // 2
-    length = plane.shape[dim] - last
-    even = weights[0] == weights[last]
-    total = plane.narrow(dim, centre, length) * weights[centre] if even else None
-    for tap in range(centre):
-        one = plane.narrow(dim, last - tap, length)
-        other = plane.narrow(dim, tap, length)
-        pair = one + other if even else one - other
-        weight = weights[last - tap]
-        total = pair * weight if total is None else total.add_(pair, alpha=weight)
-    assert total is not None
-    return total
-
-
 def _blurred_along_rows(plane: Tensor, spread: tuple[float, ...]) -> Tensor:
     """Return a plane blurred by the eye's line spread, along its rows."""
     reach = len(spread) // 2
-    return _along(functional.pad(plane, (reach, reach, 0, 0), mode="replicate"), spread, -1)
+    return along(functional.pad(plane, (reach, reach, 0, 0), mode="replicate"), spread, -1)
 
 
 def _blurred_along_columns(plane: Tensor, spread: tuple[float, ...]) -> Tensor:
     """Return a plane blurred by the eye's line spread, along its columns."""
     reach = len(spread) // 2
-    return _along(functional.pad(plane, (0, 0, reach, reach), mode="replicate"), spread, -2)
-
-
-def _halved_along_rows(plane: Tensor) -> Tensor:
-    """Return every second sample of the smoothed rows, ceil(w / 2) of them."""
-    padded, width = functional.pad(plane, (2, 2, 0, 0), mode="replicate"), plane.shape[-1]
-    taps = [padded[..., tap : tap + width : 2] for tap in range(5)]
-    return CENTRE * taps[2] + NEXT * (taps[1] + taps[3]) + OUTER * (taps[0] + taps[4])
-
-
-def _halved_along_columns(plane: Tensor) -> Tensor:
-    """Return every second sample of the smoothed columns, ceil(h / 2) of them."""
-    padded, height = functional.pad(plane, (0, 0, 2, 2), mode="replicate"), plane.shape[-2]
-    taps = [padded[..., tap : tap + height : 2, :] for tap in range(5)]
-    return CENTRE * taps[2] + NEXT * (taps[1] + taps[3]) + OUTER * (taps[0] + taps[4])
-
-
-def _doubled_along_rows(plane: Tensor, width: int) -> Tensor:
-    """Return ``width`` samples of the rows, between whose samples they are smooth."""
-    padded = functional.pad(plane, (1, 1, 0, 0), mode="replicate")
-    left, here, right = padded[..., :-2], padded[..., 1:-1], padded[..., 2:]
-    even = 2.0 * CENTRE * here + 2.0 * OUTER * (left + right)
-    return torch.stack((even, 2.0 * NEXT * (here + right)), -1).flatten(-2)[..., :width]
-
-
-def _doubled_along_columns(plane: Tensor, height: int) -> Tensor:
-    """Return ``height`` samples of the columns, between whose samples they are smooth."""
-    padded = functional.pad(plane, (0, 0, 1, 1), mode="replicate")
-    up, here, down = padded[..., :-2, :], padded[..., 1:-1, :], padded[..., 2:, :]
-    even = 2.0 * CENTRE * here + 2.0 * OUTER * (up + down)
-    return torch.stack((even, 2.0 * NEXT * (here + down)), -2).flatten(-3, -2)[..., :height, :]
+    return along(functional.pad(plane, (0, 0, reach, reach), mode="replicate"), spread, -2)
 
 
 def _divided(plane: Tensor, lowpass: Tensor, around: Tensor) -> Tensor:
@@ -341,37 +237,9 @@ def _divided(plane: Tensor, lowpass: Tensor, around: Tensor) -> Tensor:
     return ((plane - lowpass) / adapted).clamp(-LARGEST, LARGEST)
 
 
-def _across(contrast: Tensor) -> tuple[Tensor, ...]:
-    """Return the rows of (B, 1, h, w + 8) filtered by the five one-dimensional filters."""
-    filters = (GAUSSIAN, FIRST, SECOND, THIRD, CROSSED)
-    return tuple(_along(contrast, weights, -1) for weights in filters)
-
-
-def _energies(across: tuple[Tensor, ...]) -> Tensor:
-    """Return the energy of quadrature pairs at 0, 45, 90 and 135 degrees, (B, 4, h, w).
-
-    From what `_across` gives, (B, 1, h + 8, w). 0 degrees is a vertical grating. Seven basis
-    filters, each a product of two of the five one-dimensional ones, are steered.
-    """
-    smooth, first, second, third, crossed = across
-    # Even, times x^2, 2 x y and y^2 of a direction: (2 x^2 - 1), 2 x y and (2 y^2 - 1).
-    even_xx = _along(second, GAUSSIAN, -2)
-    even_xy = 2.0 * _along(first, FIRST, -2)
-    even_yy = _along(smooth, SECOND, -2)
-    # Odd, times x^3, 3 x^2 y, 3 x y^2 and y^3 of a direction.
-    odd_xxx = _along(third, GAUSSIAN, -2)
-    odd_xxy = _along(crossed, FIRST, -2)
-    odd_xyy = _along(first, CROSSED, -2)
-    odd_yyy = _along(smooth, THIRD, -2)
-    half, root = 0.5 / EVEN_GAIN, 0.5**1.5 / ODD_GAIN
-    evens = half * (even_xx + even_yy), (2.0 * half) * even_xy
-    odds = root * (odd_xxx + 3.0 * odd_xyy), root * (odd_yyy + 3.0 * odd_xxy)
-    pairs = (
-        (even_xx / EVEN_GAIN, odd_xxx / ODD_GAIN),
-        (evens[0] + evens[1], odds[0] + odds[1]),
-        (even_yy / EVEN_GAIN, odd_yyy / ODD_GAIN),
-        (evens[0] - evens[1], odds[0] - odds[1]),
-    )
+def _energies(rows: tuple[Tensor, ...]) -> Tensor:
+    """Return the energy of the quadrature pairs, (B, 4, h, w), from what `across` gives."""
+    pairs = oriented.quadrature(rows, EVEN_GAIN, ODD_GAIN)
     return torch.cat([even * even + odd * odd for even, odd in pairs], 1)
 
 

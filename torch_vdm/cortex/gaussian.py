@@ -1,0 +1,104 @@
+"""The Gaussian pyramid of Burt and Adelson 1983, along rows and columns.
+
+P. J. Burt and E. H. Adelson, The Laplacian Pyramid as a Compact Image Code (IEEE Transactions on
+Communications 31, 1983). Filters are additions of slices: faster here than a convolution, and in
+full precision under autocast and TF32. Rows and columns are steps of their own, for compiled code
+would filter the rows anew for each tap of a column.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from torch_vdm.fast import SMALLEST, compiled
+
+# Weights of the lowpass, of sum 1; a = 3/8. Status: source.
+CENTRE, NEXT, OUTER = 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0
+
+
+def along(plane: Tensor, weights: Sequence[float], dim: int, step: int = 1) -> Tensor:
+    """Correlate with even or odd weights along ``dim``, -1 or -2, at every ``step``-th place.
+
+    Their number is odd; ``dim`` shortens by it less one. Taps of equal size are added, or
+    subtracted, before they are weighted.
+    """
+    last = len(weights) - 1
+    centre = last // 2
+    reach = plane.shape[dim] - last
+
+    def shifted(tap: int) -> Tensor:
+        places = slice(tap, tap + reach, step)
+        return plane[..., places] if dim == -1 else plane[..., places, :]
+
+    even = weights[0] == weights[last]
+    total = shifted(centre) * weights[centre] if even else None
+    for tap in range(centre):
+        one, other = shifted(last - tap), shifted(tap)
+        pair = one + other if even else one - other
+        weight = weights[last - tap]
+        total = pair * weight if total is None else total.add_(pair, alpha=weight)
+    assert total is not None
+    return total
+
+
+def response(weights: Sequence[float], frequency: float) -> float:
+    """Return what even or odd weights leave of a grating of ``frequency`` cycles/sample."""
+    centre = len(weights) // 2
+    phases = [2.0 * math.pi * frequency * (tap - centre) for tap in range(len(weights))]
+    even = sum(weight * math.cos(phase) for weight, phase in zip(weights, phases, strict=True))
+    odd = sum(weight * math.sin(phase) for weight, phase in zip(weights, phases, strict=True))
+    return math.hypot(even, odd)
+
+
+def lowpass_response(frequency: float) -> float:
+    """Return what one reduction leaves of a grating of ``frequency`` cycles/sample."""
+    return response((OUTER, NEXT, CENTRE, NEXT, OUTER), frequency)
+
+
+def reduce(plane: Tensor, fast: bool = False) -> Tensor:
+    """Return the next coarser plane: every second sample, ceil(h / 2) x ceil(w / 2) of them."""
+    rows: Tensor = step(_reduced_rows, plane, fast)(plane)
+    columns: Tensor = step(_reduced_columns, plane, fast)(rows)
+    return columns
+
+
+def expand(plane: Tensor, size: tuple[int, int], fast: bool = False) -> Tensor:
+    """Return a plane at the ``size`` of the next finer one, smooth between its own samples."""
+    rows: Tensor = step(_expanded_rows, plane, fast)(plane, size[1])
+    columns: Tensor = step(_expanded_columns, plane, fast)(rows, size[0])
+    return columns
+
+
+def step(function: Callable[..., Any], plane: Tensor, fast: bool) -> Callable[..., Any]:
+    """Return a step's compiled form where it pays."""
+    return compiled(function) if fast and plane.numel() >= SMALLEST else function
+
+
+def _reduced_rows(plane: Tensor) -> Tensor:
+    padded, width = functional.pad(plane, (2, 2, 0, 0), mode="replicate"), plane.shape[-1]
+    taps = [padded[..., tap : tap + width : 2] for tap in range(5)]
+    return CENTRE * taps[2] + NEXT * (taps[1] + taps[3]) + OUTER * (taps[0] + taps[4])
+
+
+def _reduced_columns(plane: Tensor) -> Tensor:
+    padded, height = functional.pad(plane, (0, 0, 2, 2), mode="replicate"), plane.shape[-2]
+    taps = [padded[..., tap : tap + height : 2, :] for tap in range(5)]
+    return CENTRE * taps[2] + NEXT * (taps[1] + taps[3]) + OUTER * (taps[0] + taps[4])
+
+
+def _expanded_rows(plane: Tensor, width: int) -> Tensor:
+    padded = functional.pad(plane, (1, 1, 0, 0), mode="replicate")
+    left, here, right = padded[..., :-2], padded[..., 1:-1], padded[..., 2:]
+    even = 2.0 * CENTRE * here + 2.0 * OUTER * (left + right)
+    return torch.stack((even, 2.0 * NEXT * (here + right)), -1).flatten(-2)[..., :width]
+
+
+def _expanded_columns(plane: Tensor, height: int) -> Tensor:
+    padded = functional.pad(plane, (0, 0, 1, 1), mode="replicate")
+    up, here, down = padded[..., :-2, :], padded[..., 1:-1, :], padded[..., 2:, :]
+    even = 2.0 * CENTRE * here + 2.0 * OUTER * (up + down)
+    return torch.stack((even, 2.0 * NEXT * (here + down)), -2).flatten(-3, -2)[..., :height, :]
