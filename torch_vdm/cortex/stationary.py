@@ -1,0 +1,160 @@
+"""The Haar decomposition with shifts: nodes overlap, so that no place and no phase is preferred."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from torch_vdm.cortex.haar import Haar
+from torch_vdm.cortex.transform import Cortex
+from torch_vdm.fast import SMALLEST, compiled
+
+# The exponent of the sum over orientations by which a diagonal grating is made as strong as a
+# vertical one; that of the detection score. Status: choice.
+EXPONENT = 4.0
+
+
+@dataclass(frozen=True)
+class StationaryHaar:
+    """The Haar wavelets at four shifts a node, four times the coefficients of `Haar`.
+
+    A node lies at every half of a node in x and in y. At half a node alone, a grating of one cycle
+    a node is met at its peaks or at its zeros only, wherever the nodes lie. So every second row and
+    column of nodes is shifted by a quarter more, and any two by two neighbours lie at four
+    different quarters of a node both in x and in y. The finest level, whose nodes are 2 pixels
+    wide, has no quarters.
+
+    The paper's plane d3 is tuned to diagonal gratings; it has the frequency and the gain that it
+    has for these.
+    """
+
+    shifts = 2
+    phases = 1
+
+    def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:
+        """Decompose (B, C, H, W) to the coarsest level; arguments as `Haar.decompose`.
+
+        Returns
+        -------
+        Cortex
+            ``details[l]`` is (B, C, 3, h, w) as in `Haar`, but the finest is of the image's own
+            size and each next one of half its sides, rounded up. The node (y, x) begins at the
+            pixel (2^k y, 2^k x) of level k from the finest, or 2^(k - 1) after it.
+        """
+        plain = Haar().decompose(planes, fast, true_means)
+        size = (planes.shape[-2], planes.shape[-1])
+        # The means of nodes of 1, 2, 4 ... pixels.
+        means = [planes, *reversed(plain.lowpass)] if plain.details else [planes]
+        details: list[Tensor] = []
+        lowpass: list[Tensor] = []
+        for level in range(len(plain.details)):
+            # The halves or, from the second level on, the quarters of a node.
+            node = 2 ** max(level - 1, 0)
+            parts = means[max(level - 1, 0)]
+            if true_means:
+                parts = _faded(parts, size, node)
+            analyse = _halves if level == 0 else _quarters
+            use = compiled(analyse) if fast and parts.numel() >= SMALLEST else analyse
+            mean, detail = use(parts)
+            details.append(detail)
+            lowpass.append(mean)
+        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [planes])), plain.mean)
+
+    def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
+        """Return the best frequency, cycles/pixel, and its gain for d1, d2 and d3."""
+        return _peaks(level_from_finest)
+
+
+def _faded(parts: Tensor, size: tuple[int, int], node: int) -> Tensor:
+    """Weaken a last row or column that has only a share r of its pixels.
+
+    As in `torch_vdm.quadtree.complete`: R becomes L + 2 r / (1 + r) (R - L), where L is its
+    neighbour, so that (L + R) / 2 is the mean of the real pixels of both.
+    """
+    for side, axis in zip(size, (-2, -1), strict=True):
+        count = parts.shape[axis]
+        share = (side % node or node) / node
+        if count == 1 or share == 1.0:
+            continue
+        before, last = parts.narrow(axis, count - 2, 1), parts.narrow(axis, count - 1, 1)
+        last = before + 2.0 * share / (1.0 + share) * (last - before)
+        parts = torch.cat((parts.narrow(axis, 0, count - 1), last), axis)
+    return parts
+
+
+def _combined(corner: Callable[[int, int], Tensor], apart: int) -> tuple[Tensor, Tensor]:
+    """Return lowpass and details, Eq. 2, of the four quarters of nodes."""
+    left, right = corner(0, 0), corner(0, apart)
+    top_sum, top_difference = left + right, left - right
+    left, right = corner(apart, 0), corner(apart, apart)
+    bottom_sum, bottom_difference = left + right, left - right
+    details = (
+        top_difference + bottom_difference,
+        top_sum - bottom_sum,
+        top_difference - bottom_difference,
+    )
+    return 0.25 * (top_sum + bottom_sum), torch.stack(details, 2).mul_(0.25)
+
+
+def _halves(parts: Tensor) -> tuple[Tensor, Tensor]:
+    """Return lowpass and details of nodes of 2 x 2 parts that begin at every part."""
+    height, width = parts.shape[-2:]
+    padded = functional.pad(parts, (0, 1, 0, 1), mode="replicate")
+    return _combined(lambda y, x: padded[..., y : y + height, x : x + width], 1)
+
+
+def _quarters(parts: Tensor) -> tuple[Tensor, Tensor]:
+    """Return lowpass and details of nodes of 4 x 4 parts that begin at every second part or next.
+
+    In rows of two by two nodes: at (0, 0), (1, 3), (2, 1) and (3, 2), where half a node is 2.
+    """
+    height, width = ((side + 1) // 2 for side in parts.shape[-2:])
+    rows, columns = (height + 1) // 2, (width + 1) // 2
+    more = 4 * columns + 3 - parts.shape[-1], 4 * rows + 3 - parts.shape[-2]
+    padded = functional.pad(parts, (0, more[0], 0, more[1]), mode="replicate")
+    halves = padded[..., :-1, :] + padded[..., 1:, :]
+    halves = 0.25 * (halves[..., :-1] + halves[..., 1:])
+
+    def nodes(top: int, left: int) -> tuple[Tensor, Tensor]:
+        def corner(y: int, x: int) -> Tensor:
+            y, x = top + y, left + x
+            return halves[..., y : y + 4 * rows - 3 : 4, x : x + 4 * columns - 3 : 4]
+
+        return _combined(corner, 2)
+
+    four = nodes(0, 0), nodes(1, 3), nodes(2, 1), nodes(3, 2)
+    lowpass, details = (
+        _interleaved(*planes)[..., :height, :width] for planes in zip(*four, strict=True)
+    )
+    return lowpass, details
+
+
+def _interleaved(one: Tensor, right: Tensor, below: Tensor, across: Tensor) -> Tensor:
+    """Return (..., 2 h, 2 w) with each of four planes at one place of two by two."""
+    upper = torch.stack((one, right), -1).flatten(-2)
+    lower = torch.stack((below, across), -1).flatten(-2)
+    return torch.stack((upper, lower), -2).flatten(-3, -2)
+
+
+@lru_cache
+def _peaks(level_from_finest: int) -> tuple[tuple[float, float], ...]:
+    """Return what `StationaryHaar.peaks` does.
+
+    d1 and d2 are tuned to gratings along their own axis, and there to what `Haar.peak` gives. d3 is
+    the wavelet in both directions, so its best grating is a diagonal one of sqrt(2) times the
+    frequency. Its gain is such that a diagonal grating of the frequency f of d1 and d2 is as strong
+    in the sum over the three, of EXPONENT, as a vertical one: with W and L what the wavelet and the
+    window leave of f / sqrt(2), and g of f, 2 (W L / g)^4 + (W^2 / gain)^4 = 1.
+    """
+    frequency, gain = Haar().peak(level_from_finest)
+    half = 2**level_from_finest
+    turn = math.pi * frequency / math.sqrt(2.0)
+    wavelet = math.sin(half * turn) ** 2 / (half * math.sin(turn))
+    window = math.sin(2 * half * turn) / (2 * half * math.sin(turn))
+    others = 2.0 * (wavelet * window / gain) ** EXPONENT
+    diagonal = wavelet**2 / (1.0 - others) ** (1.0 / EXPONENT)
+    return (frequency, gain), (frequency, gain), (math.sqrt(2.0) * frequency, diagonal)

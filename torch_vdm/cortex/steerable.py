@@ -1,0 +1,174 @@
+"""A pyramid of oriented quadrature pairs: no phase, no place and no direction is preferred."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from torch_vdm.cortex import oriented
+from torch_vdm.cortex.gaussian import expand, lowpass_response, reduce, step
+from torch_vdm.cortex.transform import Cortex
+from torch_vdm.fast import SMALLEST
+
+# The image half-way between its pixels, which the finest level needs: a sinc of so many taps on
+# either side, under a Hann window. Status: choice.
+HALFWAY = 8
+
+# Planes with more numbers are filtered in bands of rows, which stay in the processor's cache.
+# Status: choice, measured.
+LARGEST_AT_ONCE = 2**17
+
+_PLACES = [tap + 0.5 for tap in range(HALFWAY)]
+_SINC = [
+    math.sin(math.pi * x) / x * (1.0 + math.cos(math.pi * x / (HALFWAY + 0.5))) for x in _PLACES
+]
+# Of the pairs of pixels around the place, the nearest first; their sum is a half.
+WEIGHTS = tuple(0.5 * weight / sum(_SINC) for weight in _SINC)
+
+
+class Peak(NamedTuple):
+    """What a level responds to best."""
+
+    frequency: float
+    """Cycles/pixel."""
+    even: float
+    """What the level's band and even filter leave of a grating there."""
+    odd: float
+    """The same of the odd filter."""
+
+
+@dataclass(frozen=True)
+class Steerable:
+    """Even and odd filters at 0, 45, 90 and 135 degrees on every band of a Laplacian pyramid.
+
+    The filters are those of `torch_vdm.cortex.oriented`. A band is filtered on a grid of twice the
+    density of its level, the finest between the image's pixels, and every second place is kept:
+    nodes at the places of `StationaryHaar`, 10.7 times the coefficients of `Haar`.
+
+    Even and odd responses are kept apart, with their signs: the two images are compared by the
+    length of the difference of their pairs, which no phase changes.
+    """
+
+    shifts = 2
+    phases = 2
+
+    def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:  # noqa: ARG002
+        """Decompose (B, C, H, W) to the coarsest level, by compiled steps if ``fast``.
+
+        ``true_means`` changes nothing: no sample of this pyramid stands for repeated pixels.
+
+        Returns
+        -------
+        Cortex
+            ``details[l]`` is (B, C, 8, h, w): for 0, 45, 90 and 135 degrees the even and the odd
+            response, each 1 at a level's best frequency for a grating of amplitude 1. Sizes as of
+            `StationaryHaar`.
+        """
+        mean = planes.mean((-2, -1), keepdim=True)
+        details: list[Tensor] = []
+        lowpass: list[Tensor] = []
+        finer, plane = _doubled(_doubled(planes, -1), -2), planes
+        for level in range((max(planes.shape[-2:]) - 1).bit_length()):
+            smooth = expand(plane, (finer.shape[-2], finer.shape[-1]), fast)
+            if level > 0:
+                lowpass.append(_next(smooth))
+            size = (plane.shape[-2], plane.shape[-1])
+            # The nodes lie between those of the next finer level: at the odd ones of the doubled
+            # image, the even ones but the first of all others.
+            details.append(_responses(finer - smooth, size, 1 if level == 0 else 2, level, fast))
+            finer, plane = plane, reduce(plane, fast)
+        if details:
+            lowpass.append(_next(expand(plane, (finer.shape[-2], finer.shape[-1]), fast)))
+        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [planes])), mean)
+
+    def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
+        """Return the best frequency of a level, in cycles/pixel, and the gain there: 1."""
+        return ((_peak(level_from_finest).frequency, 1.0),)
+
+
+def _doubled(plane: Tensor, dim: int) -> Tensor:
+    """Return a plane with, after every sample along ``dim``, one half-way to the next."""
+    sides = (HALFWAY - 1, HALFWAY, 0, 0) if dim == -1 else (0, 0, HALFWAY - 1, HALFWAY)
+    padded = functional.pad(plane, sides, mode="replicate")
+    length = plane.shape[dim]
+    between = torch.zeros_like(plane)
+    for tap, weight in enumerate(WEIGHTS):
+        pair = padded.narrow(dim, HALFWAY - 1 - tap, length)
+        between = between + weight * (pair + padded.narrow(dim, HALFWAY + tap, length))
+    return torch.stack((plane, between), dim).flatten(dim - 1, dim)
+
+
+def _next(plane: Tensor) -> Tensor:
+    """Return a plane whose samples are those of the next row and column."""
+    padded = functional.pad(plane, (0, 1, 0, 1), mode="replicate")
+    return padded[..., 1:, 1:].contiguous()
+
+
+def _responses(
+    band: Tensor, size: tuple[int, int], first: int, level_from_finest: int, fast: bool
+) -> Tensor:
+    """Return the responses (B, C, 8, h, w) to a band at every second place from ``first``."""
+    reach = oriented.REACH
+    more = [
+        first + 2 * (nodes - 1) + reach + 1 - places
+        for nodes, places in zip(size, band.shape[-2:], strict=True)
+    ]
+    padded = functional.pad(band, (reach, more[1], reach, more[0]), mode="replicate")
+    padded = padded[..., first:, first:]
+    peak = _peak(level_from_finest)
+    fast = fast and band.numel() >= SMALLEST
+    rows = size[0] if fast else max(1, LARGEST_AT_ONCE * size[0] // band.numel())
+    across = step(oriented.across, band, fast)
+    pairs = step(_paired, band, fast)
+    parts = []
+    for top in range(0, size[0], rows):
+        end = 2 * min(top + rows, size[0]) - 1 + 2 * reach
+        parts.append(pairs(across(padded[..., 2 * top : end, :], 2), peak.even, peak.odd))
+    return torch.cat(parts, -2) if len(parts) > 1 else parts[0]
+
+
+def _paired(rows: tuple[Tensor, ...], even: float, odd: float) -> Tensor:
+    pairs = oriented.quadrature(rows, even, odd, 2)
+    return torch.stack([response for pair in pairs for response in pair], 2)
+
+
+@lru_cache
+def _peak(level_from_finest: int) -> Peak:
+    """Maximise what the pyramid and the even filter leave of a grating along a row.
+
+    Between 1/4 and 4 times the frequency at which the filter alone is best, a quarter of a cycle a
+    sample or so, there is one maximum. What aliases is not counted.
+    """
+    samples = 0.5 * 2.0**level_from_finest  # of the band, per cycle/pixel
+
+    def band(frequency: float) -> float:
+        if level_from_finest == 0:
+            between = 2.0 * sum(
+                weight * math.cos(2.0 * math.pi * frequency * x)
+                for weight, x in zip(WEIGHTS, _PLACES, strict=True)
+            )
+            return 0.5 * (1.0 + between) - lowpass_response(samples * frequency)
+        passed = 1.0
+        for finer in range(level_from_finest - 1):
+            passed *= lowpass_response(2.0**finer * frequency)
+        return passed * (1.0 - lowpass_response(samples * frequency) ** 2)
+
+    def left(frequency: float) -> float:
+        return band(frequency) * oriented.even_gain(samples * frequency)
+
+    low, high = 0.1 / samples, (0.25 if level_from_finest == 0 else 0.4) / samples
+    ratio = 0.5 * (math.sqrt(5.0) - 1.0)
+    while high - low > 1e-9 * high:
+        one, other = high - ratio * (high - low), low + ratio * (high - low)
+        low, high = (low, other) if left(one) > left(other) else (one, high)
+    frequency = 0.5 * (low + high)
+    passed = band(frequency)
+    return Peak(
+        frequency,
+        passed * oriented.even_gain(samples * frequency),
+        passed * oriented.odd_gain(samples * frequency),
+    )
