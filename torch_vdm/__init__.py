@@ -1,6 +1,6 @@
 """The JND meter for images that are computed: a visual difference metric in PyTorch."""
 
-from torch_vdm.cortex import Haar
+from torch_vdm.cortex import Haar, StationaryHaar, Steerable
 from torch_vdm.display import Display, pixels_per_degree
 from torch_vdm.effects import Effects
 from torch_vdm.io import ImageError, read_image, write_image
@@ -17,6 +17,8 @@ __all__ = [
     "Haar",
     "ImageError",
     "Observer",
+    "StationaryHaar",
+    "Steerable",
     "VDMLoss",
     "pixels_per_degree",
     "read_image",

@@ -39,6 +39,15 @@ def local_visual_difference(difference: Tensor, exponent: Tensor) -> Tensor:
     return (size * size * rest).sum((1, 2)).unsqueeze(1)
 
 
+def local_visual_difference_of_energy(energy: Tensor, exponent: Tensor) -> Tensor:
+    """Return the local visual difference of squared differences: their power of exponent / 2.
+
+    Arguments as `local_visual_difference`, whose square ``energy`` is.
+    """
+    rest = torch.exp2((0.5 * exponent - 1.0) * torch.log2(energy.clamp_min(SMALLEST_DIFFERENCE)))
+    return (energy * rest).sum((1, 2)).unsqueeze(1)
+
+
 def accumulate(local: Sequence[Tensor], root: Tensor) -> Tensor:
     """Sum the local differences down every path of the quad-tree.
 

@@ -19,3 +19,36 @@ def pool(surrounded: Tensor) -> Tensor:
     """
     rows = surrounded[..., :-2, :] + surrounded[..., 1:-1, :] + surrounded[..., 2:, :]
     return (rows[..., :-2] + rows[..., 1:-1] + rows[..., 2:]) / 9.0
+
+
+def phase_energy(responses: Tensor, phases: int) -> Tensor:
+    """Return the mean square of every ``phases`` successive orientations.
+
+    Of overlapping nodes and of quadrature pairs the energy is pooled: it hardly depends on the
+    phase of a grating, where the mean of absolute values does.
+    """
+    energy = responses * responses
+    return energy.unflatten(2, (-1, phases)).mean(3) if phases > 1 else energy
+
+
+def surround_halves(energy: Tensor, nodes: int) -> Tensor:
+    """Repeat the border as `pool_halves` needs, over ``nodes`` nodes."""
+    sides = (nodes, nodes - 1, nodes, nodes - 1)
+    padded = functional.pad(energy.flatten(1, 2), sides, mode="replicate")
+    return padded.view(*energy.shape[:3], *padded.shape[2:])
+
+
+def pool_halves(surrounded: Tensor, nodes: int, dim: int) -> Tensor:
+    """Return along ``dim``, for every half of a node, the mean over those who cover it.
+
+    The halves of a node are covered by two overlapping nodes, ``nodes`` times as many with the
+    nodes beside these: 3 of them is the 3x3 pooling of `pool` at each shift, and the mean of the
+    shifts.
+    """
+    length = surrounded.shape[dim] - 1
+    total = surrounded.narrow(dim, 0, length) + surrounded.narrow(dim, 1, length)
+    pairs = [total.narrow(dim, 2 * node, length - 2 * (nodes - 1)) for node in range(nodes)]
+    total = pairs[0]
+    for pair in pairs[1:]:
+        total = total + pair
+    return total / (2.0 * nodes)

@@ -1,5 +1,6 @@
 """The visual difference metric: the stages of Fig. 2, in order. Only this file knows the order."""
 
+import math
 from typing import Any, NamedTuple, Self
 
 import torch
@@ -17,14 +18,19 @@ from torch_vdm.contrast import (
 from torch_vdm.cortex import Cortex, Haar, Transform
 from torch_vdm.csf import barten, butterworth, dimming
 from torch_vdm.display import BT709_TO_XYZ, Display
-from torch_vdm.distance import accumulate, just_noticeable, local_visual_difference
+from torch_vdm.distance import (
+    accumulate,
+    just_noticeable,
+    local_visual_difference,
+    local_visual_difference_of_energy,
+)
 from torch_vdm.effects import Effects
 from torch_vdm.fast import SMALLEST, compiled
 from torch_vdm.masking import energy_transducer, signed_transducer
 from torch_vdm.matrix import mix
 from torch_vdm.observer import Observer
 from torch_vdm.pair import Nonfinite, PairMetric
-from torch_vdm.pooling import pool, surround
+from torch_vdm.pooling import phase_energy, pool, pool_halves, surround, surround_halves
 from torch_vdm.quadtree import push
 from torch_vdm.sarnoff import Sarnoff
 
@@ -39,9 +45,9 @@ class Level(NamedTuple):
     """What a level of the transform responds to."""
 
     frequency: Tensor
-    """0-dim, cycles/degree: the frequency of its best response."""
+    """Cycles/degree: the frequency of its best response; one for each orientation or for all."""
     gain: Tensor
-    """0-dim: what its contrast is divided by."""
+    """What its contrast is divided by; as many."""
 
 
 class VDM(PairMetric):
@@ -97,7 +103,7 @@ class VDM(PairMetric):
         self.transform = transform or Haar()
         self.effects = effects or Effects()
 
-        peaks = [self.transform.peak(level) for level in range(DEEPEST)]
+        peaks = [self.transform.peaks(level) for level in range(DEEPEST)]
         cones = torch.tensor(XYZ_TO_SML, dtype=torch.float64)
         constants = {
             "primaries": BT709_TO_XYZ,
@@ -105,8 +111,12 @@ class VDM(PairMetric):
             "opponents": SML_TO_OPPONENTS if self.effects.chromatic else SML_TO_OPPONENTS[:1],
             "luminance_of_cones": torch.linalg.inv(cones)[1:2],
             "dark_cones": self.observer.dark_light * cones.sum(1),
-            "frequencies": [self.ppd * frequency for frequency, _ in peaks],
-            "gains": [gain if self.observer.level_gain else 1.0 for _, gain in peaks],
+            "frequencies": [[self.ppd * frequency for frequency, _ in level] for level in peaks],
+            # Without them the orientations keep what they have to one another.
+            "gains": [
+                [gain if self.observer.level_gain else gain / level[0][1] for _, gain in level]
+                for level in peaks
+            ],
             **self.observer.numbers(),
         }
         if self.observer.lowpass_gains is not None:
@@ -136,7 +146,8 @@ class VDM(PairMetric):
         return self.compare(self.represent(test), self.represent(reference))
 
     def _to_pixels(self, plane: Tensor, size: tuple[int, int]) -> Tensor:
-        return push(plane, size)
+        # The leaves of overlapping nodes are the pixels.
+        return push(plane, size) if self.transform.shifts == 1 else plane
 
     def score(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the detection score of each item, (B,), JND: the image as one stimulus.
@@ -152,9 +163,23 @@ class VDM(PairMetric):
             first, second = self.represent(one), self.represent(other)
             total = (self.lowpass_difference(first, second) ** exponent).sum((1, 2, 3))
             for seen, expected in zip(self.respond(first), self.respond(second), strict=True):
-                total = total + ((seen - expected).abs() ** exponent).sum((1, 2, 3, 4))
+                total = total + self._scored(seen - expected, exponent)
             totals.append(total)
         return just_noticeable(torch.cat(totals) / constants["score_coefficients"], exponent)
+
+    def _scored(self, difference: Tensor, exponent: Tensor) -> Tensor:
+        """Return what a level adds to the sum of the score, (B,)."""
+        shifts, phases = self.transform.shifts, self.transform.phases
+        if shifts == 1 and phases == 1:
+            return (difference.abs() ** exponent).sum((1, 2, 3, 4))
+        surrounded = surround_halves(phase_energy(difference, phases), 1)
+        energy = pool_halves(pool_halves(surrounded, 1, -1), 1, -2)
+        # As many coefficients as nodes side by side would have, and for one phase of a grating
+        # its mean power over all: that of abs(cos)^exponent over that of its mean square.
+        half = 0.5 * exponent
+        spread = torch.exp(torch.lgamma(half + 0.5) - torch.lgamma(half + 1.0)) / math.sqrt(math.pi)
+        weight = spread * 2.0**half / shifts**2
+        return weight * (energy**half).sum((1, 2, 3, 4))
 
     def represent(self, image: Tensor) -> Cortex:
         """Return the cortex representation of an image: display, cones, transform.
@@ -227,32 +252,49 @@ class VDM(PairMetric):
         constants: dict[str, Tensor],
     ) -> Tensor:
         """Return the local visual difference (B, 1, h, w) of one level."""
-        details = first.details[number], second.details[number]
-        around = (
-            *self._sight(first, number, level, constants),
-            *self._sight(second, number, level, constants),
-            constants["opponents"],
-            constants["transducer_exponent"],
-            self.observer.signed,
-            self.effects.masking,
-        )
-        exponent = constants["summation_exponent"]
-        size = details[0].numel()
-        fast = self._fast and size >= SMALLEST
+        one, other = first.details[number], second.details[number]
+        scale, sensitivity = self._sight(first, number, level, constants)
+        other_scale, other_sensitivity = self._sight(second, number, level, constants)
+        phases = self.transform.phases
+        fast = self._fast and one.numel() >= SMALLEST
         respond = compiled(_response_difference) if fast else _response_difference
-        gather = compiled(_pooled_difference) if fast else _pooled_difference
         # One orientation at a time where the planes are large: what is computed on the way then
         # stays in the processor's cache. Compiled code keeps nothing on the way.
-        at_once = fast or size <= LARGEST_AT_ONCE
-        parts = [details] if at_once else zip(*(d.split(1, 2) for d in details), strict=True)
-        local: list[Tensor] = []
-        for one, other in parts:
-            difference = respond(one, other, *around)
-            if self.effects.pooling:
-                local.append(gather(surround(difference), exponent))
-            else:
-                local.append(local_visual_difference(difference, exponent))
+        at_once = one.shape[2] if fast or one.numel() <= LARGEST_AT_ONCE else phases
+        local = []
+        for plane in range(0, one.shape[2], at_once):
+            some = slice(plane, plane + at_once)
+            same = some if sensitivity.shape[2] > 1 else slice(None)
+            difference = respond(
+                one[:, :, some],
+                other[:, :, some],
+                scale,
+                sensitivity[:, :, same],
+                other_scale,
+                other_sensitivity[:, :, same],
+                constants["opponents"],
+                constants["transducer_exponent"],
+                self.observer.signed,
+                self.effects.masking,
+            )
+            local.append(self._gathered(difference, constants["summation_exponent"], fast))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]
+
+    def _gathered(self, difference: Tensor, exponent: Tensor, fast: bool) -> Tensor:
+        """Return the local visual difference of response differences, after spatial pooling."""
+        if self.transform.shifts == 1:
+            if not self.effects.pooling:
+                return local_visual_difference(difference, exponent)
+            gather = compiled(_pooled_difference) if fast else _pooled_difference
+            local: Tensor = gather(surround(difference), exponent)
+            return local
+        nodes = 3 if self.effects.pooling else 1
+        energy = compiled(phase_energy) if fast else phase_energy
+        rows = compiled(pool_halves) if fast else pool_halves
+        columns = compiled(_pooled_energy) if fast else _pooled_energy
+        surrounded = surround_halves(energy(difference, self.transform.phases), nodes)
+        local = columns(rows(surrounded, nodes, -1), nodes, exponent)
+        return local
 
     def _sight(
         self, cortex: Cortex, number: int, level: Level, constants: dict[str, Tensor]
@@ -261,7 +303,8 @@ class VDM(PairMetric):
 
         For each cone (B, 3, h, w): the share that chromatic aberration leaves, over the parent's
         adaptation; scaled at the parents, of which there are fewer. For each channel the contrast
-        sensitivity, (B, channels, h, w), or one node of it where it is everywhere the same.
+        sensitivity, (B, channels, orientations, h, w), or one orientation or node of it where all
+        have the same.
         """
         parent = cortex.parent_lowpass(number)
         size = (cortex.details[number].shape[-2], cortex.details[number].shape[-1])
@@ -298,7 +341,7 @@ def _response(
 ) -> Tensor:
     """Return the responses of one level of one image: local contrast to the transducer."""
     contrast = opponents(local_contrast(details, scale), matrix)
-    weighted = contrast * sensitivity.unsqueeze(2)
+    weighted = contrast * sensitivity
     if signed:
         return signed_transducer(weighted, exponent) if masking else weighted
     return energy_transducer(weighted * weighted) if masking else weighted.abs()
@@ -335,7 +378,7 @@ def _scale_and_sensitivity(
     scale = adapted(parent, constants["dark_cones"]).reciprocal()
     if effects.aberration:
         passed = attenuation(
-            level.frequency, constants["aberration_cutoff"], constants["aberration_exponent"]
+            level.frequency[0], constants["aberration_cutoff"], constants["aberration_exponent"]
         )
         scale = scale * passed.view(3, 1, 1)
     if local:
@@ -343,14 +386,21 @@ def _scale_and_sensitivity(
         luminance = seen + constants["dark_light"]
     else:
         luminance = constants["adaptation_luminance"].view(1, 1, 1, 1)
-    return scale, _sensitivity(luminance, level, constants, effects)
+    sensitivities = [
+        _sensitivity(luminance, frequency, gain, constants, effects)
+        for frequency, gain in zip(level.frequency, level.gain, strict=True)
+    ]
+    return scale, torch.stack(sensitivities, 2)
 
 
 def _sensitivity(
-    luminance: Tensor, level: Level, constants: dict[str, Tensor], effects: Effects
+    luminance: Tensor,
+    frequency: Tensor,
+    gain: Tensor,
+    constants: dict[str, Tensor],
+    effects: Effects,
 ) -> Tensor:
     """Return the contrast sensitivity of every channel, (B, channels, h, w), at a level."""
-    frequency = level.frequency
     achromatic = constants["achromatic_gain"] * barten(
         frequency, luminance, constants["achromatic_size"]
     )
@@ -365,7 +415,12 @@ def _sensitivity(
             )
             dim = dimming(luminance, constants[f"{name}_luminance"], constants[f"{name}_exponent"])
             channels.append(bright * dim)
-    return torch.cat(channels, 1) / level.gain
+    return torch.cat(channels, 1) / gain
+
+
+def _pooled_energy(surrounded: Tensor, nodes: int, exponent: Tensor) -> Tensor:
+    """Return the local visual difference of energies that are pooled along rows."""
+    return local_visual_difference_of_energy(pool_halves(surrounded, nodes, -2), exponent)
 
 
 def _pooled_difference(surrounded: Tensor, exponent: Tensor) -> Tensor:

@@ -1,6 +1,8 @@
 """Cortex filtering, the second box of Fig. 2: an image as frequency and orientation channels."""
 
 from torch_vdm.cortex.haar import Haar
+from torch_vdm.cortex.stationary import StationaryHaar
+from torch_vdm.cortex.steerable import Steerable
 from torch_vdm.cortex.transform import Cortex, Transform
 
-__all__ = ["Cortex", "Haar", "Transform"]
+__all__ = ["Cortex", "Haar", "StationaryHaar", "Steerable", "Transform"]

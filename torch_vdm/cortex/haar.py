@@ -16,6 +16,9 @@ from torch_vdm.quadtree import complete, own, pad_even
 class Haar:
     """The paper's transform: O(N), one coefficient a pixel and cone, not shift-invariant."""
 
+    shifts = 1
+    phases = 1
+
     def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:
         """Decompose (B, C, H, W) by Eq. 2 down to one node, by compiled steps if ``fast``.
 
@@ -46,6 +49,10 @@ class Haar:
     def peak(self, level_from_finest: int) -> tuple[float, float]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there."""
         return _peak(level_from_finest)
+
+    def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
+        """Return the same, for all three orientations."""
+        return (_peak(level_from_finest),)
 
 
 def _analyse(even: Tensor) -> tuple[Tensor, Tensor]:

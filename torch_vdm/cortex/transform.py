@@ -32,11 +32,27 @@ class Cortex(NamedTuple):
 class Transform(Protocol):
     """A decomposition into levels on a quad-tree, and what each level responds to."""
 
+    @property
+    def shifts(self) -> int:
+        """How many nodes a level has, in x and in y, in the width of one.
+
+        1: nodes lie side by side, the finest 2 pixels wide, and the quad-tree is the paper's. 2:
+        they overlap, and the quad-tree is that of the halves of nodes, whose leaves are the pixels.
+        The half of a node (y, x) is covered by the nodes y - 1 and y, x - 1 and x.
+        """
+
+    @property
+    def phases(self) -> int:
+        """How many successive planes of details are phases of one: 1, or 2 for even and odd."""
+
     def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:
         """Decompose (B, C, H, W) to the coarsest level, by compiled steps if ``fast``.
 
         ``true_means``: no pixel counts for more than another, at the border of an odd side too.
         """
 
-    def peak(self, level_from_finest: int) -> tuple[float, float]:
-        """Return the best frequency of a level, in cycles/pixel, and the gain there."""
+    def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
+        """Return the best frequency of a level, in cycles/pixel, and the gain there.
+
+        For each orientation, or one for all of them.
+        """
