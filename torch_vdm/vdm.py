@@ -209,6 +209,7 @@ class VDM(PairMetric):
                 constants["transducer_exponent"],
                 self.observer.signed,
                 self.effects.masking,
+                self.transform.phases,
             )
             for number, (detail, level) in enumerate(
                 zip(cortex.details, self._levels(cortex, constants), strict=True)
@@ -276,6 +277,7 @@ class VDM(PairMetric):
                 constants["transducer_exponent"],
                 self.observer.signed,
                 self.effects.masking,
+                self.transform.phases,
             )
             local.append(self._gathered(difference, constants["summation_exponent"], fast))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]
@@ -294,7 +296,7 @@ class VDM(PairMetric):
         columns = compiled(_pooled_energy) if fast else _pooled_energy
         surrounded = surround_halves(energy(difference, self.transform.phases), nodes)
         local = columns(rows(surrounded, nodes, -1), nodes, exponent)
-        return local
+        return local  # noqa: RET504  # for its type
 
     def _sight(
         self, cortex: Cortex, number: int, level: Level, constants: dict[str, Tensor]
@@ -338,12 +340,13 @@ def _response(
     exponent: Tensor,
     signed: bool,
     masking: bool,
+    phases: int,
 ) -> Tensor:
     """Return the responses of one level of one image: local contrast to the transducer."""
     contrast = opponents(local_contrast(details, scale), matrix)
     weighted = contrast * sensitivity
     if signed:
-        return signed_transducer(weighted, exponent) if masking else weighted
+        return signed_transducer(weighted, exponent, phases) if masking else weighted
     return energy_transducer(weighted * weighted) if masking else weighted.abs()
 
 
@@ -358,15 +361,16 @@ def _response_difference(
     exponent: Tensor,
     signed: bool,
     masking: bool,
+    phases: int,
 ) -> Tensor:
     """Return the difference of two images' responses at a level, absolute where they are signed.
 
     Each image by itself: equal images then take equal paths through the vectorised loops, and
     their difference is exactly 0.
     """
-    response = _response(details, scale, sensitivity, matrix, exponent, signed, masking)
+    response = _response(details, scale, sensitivity, matrix, exponent, signed, masking, phases)
     other = _response(
-        other_details, other_scale, other_sensitivity, matrix, exponent, signed, masking
+        other_details, other_scale, other_sensitivity, matrix, exponent, signed, masking, phases
     )
     return (response - other).abs() if signed else response - other
 
