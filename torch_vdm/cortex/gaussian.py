@@ -59,6 +59,13 @@ def lowpass_response(frequency: float) -> float:
     return response((OUTER, NEXT, CENTRE, NEXT, OUTER), frequency)
 
 
+def blur(plane: Tensor, fast: bool = False) -> Tensor:
+    """Return the lowpass of a plane at every one of its samples."""
+    rows: Tensor = step(_blurred_rows, plane, fast)(plane)
+    columns: Tensor = step(_blurred_columns, plane, fast)(rows)
+    return columns
+
+
 def reduce(plane: Tensor, fast: bool = False) -> Tensor:
     """Return the next coarser plane: every second sample, ceil(h / 2) x ceil(w / 2) of them."""
     rows: Tensor = step(_reduced_rows, plane, fast)(plane)
@@ -76,6 +83,16 @@ def expand(plane: Tensor, size: tuple[int, int], fast: bool = False) -> Tensor:
 def step(function: Callable[..., Any], plane: Tensor, fast: bool) -> Callable[..., Any]:
     """Return a step's compiled form where it pays."""
     return compiled(function) if fast and plane.numel() >= SMALLEST else function
+
+
+def _blurred_rows(plane: Tensor) -> Tensor:
+    padded = functional.pad(plane, (2, 2, 0, 0), mode="replicate")
+    return along(padded, (OUTER, NEXT, CENTRE, NEXT, OUTER), -1)
+
+
+def _blurred_columns(plane: Tensor) -> Tensor:
+    padded = functional.pad(plane, (0, 0, 2, 2), mode="replicate")
+    return along(padded, (OUTER, NEXT, CENTRE, NEXT, OUTER), -2)
 
 
 def _reduced_rows(plane: Tensor) -> Tensor:

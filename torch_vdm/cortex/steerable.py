@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torch_vdm.cortex import oriented
-from torch_vdm.cortex.gaussian import expand, lowpass_response, reduce, step
+from torch_vdm.cortex.gaussian import blur, lowpass_response, step
 from torch_vdm.cortex.transform import Cortex
 from torch_vdm.fast import SMALLEST
 
@@ -43,11 +43,13 @@ class Peak(NamedTuple):
 
 @dataclass(frozen=True)
 class Steerable:
-    """Even and odd filters at 0, 45, 90 and 135 degrees on every band of a Laplacian pyramid.
+    """Even and odd filters at 0, 45, 90 and 135 degrees on every band of a pyramid.
 
-    The filters are those of `torch_vdm.cortex.oriented`. A band is filtered on a grid of twice the
-    density of its level, the finest between the image's pixels, and every second place is kept:
-    nodes at the places of `StationaryHaar`, 10.7 times the coefficients of `Haar`.
+    A band is a plane of the Gaussian pyramid less its own lowpass, taken before any sample is
+    dropped, so that it has no aliases of its own. It is filtered by the pairs of
+    `torch_vdm.cortex.oriented` on a grid of twice the density of its level, the finest between the
+    image's pixels, and every second place is kept: nodes at the places of `StationaryHaar`, 10.7
+    times the coefficients of `Haar`.
 
     Even and odd responses are kept apart, with their signs: the two images are compared by the
     length of the difference of their pairs, which no phase changes.
@@ -71,18 +73,17 @@ class Steerable:
         mean = planes.mean((-2, -1), keepdim=True)
         details: list[Tensor] = []
         lowpass: list[Tensor] = []
-        finer, plane = _doubled(_doubled(planes, -1), -2), planes
+        band = _doubled(_doubled(planes, -1), -2)
+        band = band - blur(band, fast)
+        plane = planes
         for level in range((max(planes.shape[-2:]) - 1).bit_length()):
-            smooth = expand(plane, (finer.shape[-2], finer.shape[-1]), fast)
-            if level > 0:
-                lowpass.append(_next(smooth))
             size = (plane.shape[-2], plane.shape[-1])
             # The nodes lie between those of the next finer level: at the odd ones of the doubled
             # image, the even ones but the first of all others.
-            details.append(_responses(finer - smooth, size, 1 if level == 0 else 2, level, fast))
-            finer, plane = plane, reduce(plane, fast)
-        if details:
-            lowpass.append(_next(expand(plane, (finer.shape[-2], finer.shape[-1]), fast)))
+            details.append(_responses(band, size, 1 if level == 0 else 2, level, fast))
+            smooth = blur(plane, fast)
+            lowpass.append(_next(smooth))
+            band, plane = plane - smooth, smooth[..., ::2, ::2].contiguous()
         return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [planes])), mean)
 
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
@@ -151,11 +152,12 @@ def _peak(level_from_finest: int) -> Peak:
                 weight * math.cos(2.0 * math.pi * frequency * x)
                 for weight, x in zip(WEIGHTS, _PLACES, strict=True)
             )
-            return 0.5 * (1.0 + between) - lowpass_response(samples * frequency)
-        passed = 1.0
+            passed = 0.5 * (1.0 + between)
+        else:
+            passed = 1.0
         for finer in range(level_from_finest - 1):
             passed *= lowpass_response(2.0**finer * frequency)
-        return passed * (1.0 - lowpass_response(samples * frequency) ** 2)
+        return passed * (1.0 - lowpass_response(samples * frequency))
 
     def left(frequency: float) -> float:
         return band(frequency) * oriented.even_gain(samples * frequency)

@@ -1,0 +1,352 @@
+"""StationaryHaar and Steerable against the NumPy reference, and what holds of every transform."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tests.conftest import KINDS, make_xyz
+from tests.reference import calibrated, transforms
+from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, VDMLoss
+from torch_vdm.cortex import Transform
+
+PPD = 64.0
+TRANSFORMS: list[Transform] = [Haar(), StationaryHaar(), Steerable()]
+OVERLAPPING: list[Transform] = [StationaryHaar(), Steerable()]
+SIZES = [(1, 1), (1, 9), (6, 1), (8, 8), (13, 21)]
+
+
+def name(transform: Transform) -> str:
+    return type(transform).__name__
+
+
+each = pytest.mark.parametrize("transform", TRANSFORMS, ids=name)
+each_observer = pytest.mark.parametrize(
+    "observer", [Observer.paper(), Observer.calibrated()], ids=lambda o: o.name
+)
+each_overlapping = pytest.mark.parametrize("transform", OVERLAPPING, ids=name)
+
+
+def random_images(seed: int, batch: int = 1, height: int = 24, width: int = 31) -> Tensor:
+    return torch.rand(batch, 3, height, width, generator=torch.Generator().manual_seed(seed))
+
+
+def grating(
+    cycles: float, contrast: float, phase: float = 0.0, angle: float = 0.0, size: int = 128
+) -> Tensor:
+    """Return a grating (1, 3, size, size), linear, mean 0.5, ``cycles`` a pixel."""
+    y, x = torch.meshgrid(*2 * (torch.arange(size, dtype=torch.float64),), indexing="ij")
+    along = x * math.cos(math.radians(angle)) + y * math.sin(math.radians(angle))
+    wave = torch.sin(2.0 * math.pi * cycles * along + phase)
+    return (0.5 * (1.0 + contrast * wave)).expand(1, 3, size, size).contiguous()
+
+
+def metric_of(transform: Transform, observer: Observer | None = None) -> VDM:
+    return VDM(PPD, Display.linear(200.0), observer, transform)
+
+
+def reference_levels(
+    transform: Transform, plane: NDArray[np.float64]
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    if isinstance(transform, StationaryHaar):
+        return transforms.stationary_haar(plane)
+    return transforms.steerable(plane, [transform.peaks(level)[0][0] for level in range(8)])
+
+
+@each_overlapping
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("size", SIZES)
+def test_is_the_reference(transform: Transform, kind: str, size: tuple[int, int]) -> None:
+    planes = make_xyz(kind, *size, 3)[:2]
+    actual = transform.decompose(torch.from_numpy(planes)[None], true_means=True)
+    levels = len(actual.details)
+    atol = 1e-13 * float(np.abs(planes).max())
+    for cone, plane in enumerate(planes):
+        expected = reference_levels(transform, plane)
+        assert len(expected) == levels
+        for level, (details, lowpass) in enumerate(expected):
+            at = levels - 1 - level
+            ours = actual.details[at][0, cone].numpy()
+            np.testing.assert_allclose(ours, details, rtol=1e-9, atol=atol)
+            ours = actual.lowpass[at][0, cone].numpy()
+            np.testing.assert_allclose(ours, lowpass, rtol=1e-9, atol=atol)
+
+
+def parameters_of(observer: Observer) -> calibrated.CalibratedParameters:
+    names = {field.name for field in dataclasses.fields(calibrated.CalibratedParameters)}
+    numbers = {name: value for name, value in vars(observer).items() if name in names}
+    return calibrated.CalibratedParameters(**numbers)
+
+
+@each_overlapping
+@pytest.mark.parametrize("kind", ["random", "hdr", "dark", "negative"])
+@pytest.mark.parametrize("size", [(1, 1), (7, 10)])
+def test_the_map_and_the_score_are_the_references(
+    transform: Transform, kind: str, size: tuple[int, int]
+) -> None:
+    first, second = make_xyz(kind, *size, 1), make_xyz("random", *size, 2)
+    kind_of = "stationary" if isinstance(transform, StationaryHaar) else "steerable"
+    observer = Observer.calibrated()
+    peaks = [transform.peaks(level)[0] for level in range(8)]
+    metric = VDM(PPD, Display.xyz(), observer, transform)
+    images = [torch.from_numpy(image)[None] for image in (first, second)]
+    arguments = (first, second, PPD, kind_of, peaks, parameters_of(observer))
+    expected = transforms.jnd_map(*arguments)
+    np.testing.assert_allclose(metric(*images)[0, 0].numpy(), expected, rtol=1e-9, atol=1e-9)
+    single = metric(*(image.float() for image in images))[0, 0].double().numpy()
+    np.testing.assert_allclose(single, expected, rtol=1e-3, atol=1e-3)
+    exponent = observer.score_exponent
+    root = metric.lowpass_difference(*(metric.represent(image) for image in images))
+    total = transforms.score_sum(*arguments, exponent) + (root**exponent).sum().item()
+    score = (total / observer.score_coefficients) ** (1.0 / exponent)
+    assert metric.score(*images).item() == pytest.approx(score, rel=1e-6)
+
+
+@pytest.mark.parametrize("level", range(6))
+def test_the_diagonal_wavelet_has_the_peak_of_the_reference(level: int) -> None:
+    straight, _, diagonal = StationaryHaar().peaks(level)
+    assert straight == Haar().peak(level)
+    np.testing.assert_allclose(diagonal, transforms.diagonal_peak(level), rtol=1e-9)
+
+
+@pytest.mark.parametrize("level", range(5))
+def test_the_peak_of_steerable_is_that_of_its_response(level: int) -> None:
+    # The mean energy of gratings around it, decomposed: greatest at the stated one, and 1 there.
+    best, gain = Steerable().peaks(level)[0]
+    assert gain == 1.0
+    size = 64 * 2**level
+
+    def energy(cycles: float) -> float:
+        x = torch.arange(size, dtype=torch.float64)
+        wave = torch.cos(2.0 * math.pi * cycles * x + 0.4).expand(1, 1, 8 * 2**level, size)
+        details = Steerable().decompose(wave.contiguous()).details[-1 - level][0, 0, :2]
+        inner = details[..., 16:-16]
+        return inner.square().sum(0).mean().item()
+
+    assert energy(best) == pytest.approx(1.0, rel=0.03)
+    assert energy(best) > max(energy(0.93 * best), energy(1.07 * best))
+
+
+@each
+def test_flat_images_have_no_details(transform: Transform) -> None:
+    cortex = transform.decompose(torch.full((1, 3, 21, 10), 0.3))
+    assert max(details.abs().max() for details in cortex.details) < 1e-6
+    for lowpass in cortex.lowpass:
+        torch.testing.assert_close(lowpass, torch.full_like(lowpass, 0.3))
+
+
+@each
+def test_is_linear(transform: Transform) -> None:
+    one, other = random_images(1).double(), random_images(2).double()
+    mixed = transform.decompose(2.0 * one - 3.0 * other, true_means=True)
+    parts = [transform.decompose(image, true_means=True) for image in (one, other)]
+    for whole, first, second in zip(mixed.details, *(p.details for p in parts), strict=True):
+        torch.testing.assert_close(whole, 2.0 * first - 3.0 * second)
+
+
+@each
+@pytest.mark.parametrize("level", range(5))
+@pytest.mark.parametrize("angle", [0.0, 90.0])
+def test_a_grating_lands_in_its_level(transform: Transform, level: int, angle: float) -> None:
+    best, _ = transform.peaks(level)[0]
+    metric = metric_of(transform)
+    responses = metric.respond(metric.represent(grating(best, 0.05, 0.4, angle)))
+    energy = [details[:, 0].square().mean().item() for details in reversed(responses)]
+    assert energy.index(max(energy)) == level
+    # And in its orientation: d1 or 0 degrees, d2 or 90.
+    planes = list(reversed(responses))[level][0, 0].square().mean((1, 2))
+    pairs = planes.unflatten(0, (-1, transform.phases)).sum(1)
+    upright = 0 if angle == 0.0 else 1 if isinstance(transform, Haar | StationaryHaar) else 2
+    assert pairs.argmax() == upright
+
+
+def test_every_shift_of_a_node_is_a_haar_decomposition() -> None:
+    # Each of the four sets of nodes, side by side, is that of Haar on a shifted image.
+    image = torch.randn(
+        1, 1, 64, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(3)
+    )
+    shifted = StationaryHaar().decompose(image).details
+    for level in (1, 2, 3):
+        quarter = 2 ** (level - 1)
+        for y, x, down, right in ((0, 0, 0, 0), (0, 1, 1, 3), (1, 0, 2, 1), (1, 1, 3, 2)):
+            rolled = image[..., down * quarter :, right * quarter :]
+            expected = Haar().decompose(rolled).details
+            ours = shifted[-1 - level][..., y::2, x::2]
+            inner = ours[..., : ours.shape[-2] - 1, : ours.shape[-1] - 1]
+            other = expected[-1 - level][..., : inner.shape[-2], : inner.shape[-1]]
+            torch.testing.assert_close(inner, other)
+
+
+@each_overlapping
+@pytest.mark.parametrize("level", range(3))
+def test_a_shift_of_the_image_shifts_a_level(transform: Transform, level: int) -> None:
+    # By one node of a level every finer one is shifted too, away from the border.
+    step = 2 * 2**level
+    generator = torch.Generator().manual_seed(3)
+    image = torch.randn(1, 1, 96, 96, dtype=torch.float64, generator=generator)
+    moved = torch.roll(image, (step, step), (2, 3))
+    for finer in range(level + 1):
+        one, other = (transform.decompose(i).details[-1 - finer] for i in (image, moved))
+        by, edge = step // 2**finer, 48 // 2**finer // 2
+        one = torch.roll(one, (by, by), (3, 4))[..., edge:-edge, edge:-edge]
+        torch.testing.assert_close(one, other[..., edge:-edge, edge:-edge])
+
+
+@each_overlapping
+def test_an_even_shift_shifts_the_map(transform: Transform) -> None:
+    # A fine texture: what is seen lies in the levels whose nodes the shift moves by whole nodes.
+    generator = torch.Generator().manual_seed(3)
+    noise = torch.randn(1, 1, 128, 128, generator=generator)
+    fine = (noise - torch.nn.functional.avg_pool2d(noise, 5, 1, 2)).expand(1, 3, 128, 128)
+    flat = torch.full((1, 3, 128, 128), 0.5)
+    window = torch.zeros(128, 128)
+    window[48:80, 48:80] = 0.02
+    metric = VDM(16.0, Display.linear(200.0), transform=transform)
+    seen = metric(flat + window * fine, flat)
+    moved = metric(torch.roll(flat + window * fine, (4, 4), (2, 3)), flat)
+    difference = (torch.roll(seen, (4, 4), (2, 3)) - moved)[..., 32:96, 32:96]
+    assert difference.abs().mean() < 0.01 * seen[..., 32:96, 32:96].mean()
+
+
+@each
+def test_the_batch_does_not_matter(transform: Transform) -> None:
+    metric = metric_of(transform)
+    test, reference = random_images(1, 3), random_images(2, 3)
+    pairs = list(zip(test.split(1), reference.split(1), strict=True))
+    together = metric(test, reference)
+    alone = torch.cat([metric(*pair) for pair in pairs])
+    torch.testing.assert_close(together, alone, rtol=1e-5, atol=1e-5)
+    scores = torch.cat([metric.score(*pair) for pair in pairs])
+    torch.testing.assert_close(metric.score(test, reference), scores)
+
+
+@each_overlapping
+@pytest.mark.parametrize(
+    "observer", [Observer.paper(), Observer.calibrated()], ids=lambda o: o.name
+)
+@settings(max_examples=10)
+@given(
+    seed=st.integers(0, 99),
+    height=st.integers(1, 40),
+    width=st.integers(1, 40),
+    dtype=st.sampled_from([torch.float64, torch.float32, torch.float16, torch.bfloat16]),
+)
+def test_equal_images_give_exactly_zero(
+    observer: Observer, transform: Transform, seed: int, height: int, width: int, dtype: torch.dtype
+) -> None:
+    image = random_images(seed, 2, height, width).to(dtype)
+    metric = VDM(PPD, observer=observer, transform=transform)
+    assert not metric(image, image.clone()).any()
+    assert not metric.score(image, image.clone()).any()
+
+
+@each_overlapping
+def test_both_orders_give_the_same_map(transform: Transform) -> None:
+    metric = metric_of(transform)
+    one, other = random_images(1), random_images(2)
+    assert torch.equal(metric(one, other), metric(other, one))
+
+
+@each_overlapping
+@pytest.mark.parametrize(
+    "observer", [Observer.paper(), Observer.calibrated()], ids=lambda o: o.name
+)
+def test_extreme_light_gives_finite_maps_and_gradients(
+    observer: Observer, transform: Transform
+) -> None:
+    metric = VDM(PPD, Display.linear(1e6), observer, transform)
+    image = (100.0 * random_images(1) ** 8 - 0.01).requires_grad_()
+    for other in (torch.zeros_like(image), image.detach().clone(), -image.detach()):
+        seen = metric(image, other)
+        assert torch.isfinite(seen).all()
+        for result in (
+            seen.sum(),
+            metric.score(image, other).sum(),
+            metric.power(image, other).sum(),
+        ):
+            (gradient,) = torch.autograd.grad(result, image, retain_graph=True)
+            assert torch.isfinite(gradient).all()
+
+
+@each_overlapping
+def test_the_loss_has_a_gradient(transform: Transform) -> None:
+    image = random_images(1).requires_grad_()
+    loss = VDMLoss(PPD, transform=transform)(image, random_images(2))
+    (gradient,) = torch.autograd.grad(loss, image)
+    assert torch.isfinite(gradient).all()
+    assert gradient.any()
+
+
+@each_overlapping
+def test_the_compiled_route_is_the_same(transform: Transform) -> None:
+    metric = VDM(PPD, transform=transform)
+    test, reference = random_images(1, 2, 40, 50), random_images(2, 2, 40, 50)
+    expected = metric(test, reference)
+    torch.testing.assert_close(metric.compile()(test, reference), expected, rtol=1e-4, atol=1e-4)
+
+
+@each_overlapping
+def test_large_planes_in_parts_are_the_same(
+    transform: Transform, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    metric = metric_of(transform)
+    test, reference = random_images(1).double(), random_images(2).double()
+    expected = metric(test, reference)
+    monkeypatch.setattr("torch_vdm.vdm.LARGEST_AT_ONCE", 100)
+    monkeypatch.setattr("torch_vdm.cortex.steerable.LARGEST_AT_ONCE", 100)
+    torch.testing.assert_close(metric(test, reference), expected, rtol=1e-12, atol=1e-12)
+
+
+def threshold(metric: VDM, cycles: float, phase: float, angle: float = 0.0) -> float:
+    """Return the contrast, dB, at which a grating scores 1 JND: there the score is linear."""
+    contrast = 0.002
+    flat = grating(cycles, 0.0)
+    for _ in range(4):
+        contrast /= metric.score(grating(cycles, contrast, phase, angle), flat).item()
+    return 20.0 * math.log10(contrast)
+
+
+@each_overlapping
+@pytest.mark.parametrize("cpd", [2.0, 4.0, 8.0])
+def test_the_threshold_hardly_depends_on_phase(transform: Transform, cpd: float) -> None:
+    # Frequencies that the grid of nodes divides, the worst: Haar's spread is 3 dB and more.
+    metric = metric_of(transform)
+    phases = [step * math.pi / 4.0 for step in range(4)]
+    thresholds = [threshold(metric, cpd / PPD, phase) for phase in phases]
+    assert max(thresholds) - min(thresholds) < 1.0
+
+
+@each_overlapping
+@pytest.mark.parametrize("cpd", [2.0, 3.0, 5.0, 8.0])
+def test_the_threshold_hardly_depends_on_orientation(transform: Transform, cpd: float) -> None:
+    metric = metric_of(transform)
+    phases = [step * math.pi / 4.0 for step in range(4)]
+    straight, turned = (
+        sum(threshold(metric, cpd / PPD, phase, angle) for phase in phases) / len(phases)
+        for angle in (0.0, 45.0)
+    )
+    assert abs(straight - turned) < 1.0
+
+
+@each_overlapping
+@pytest.mark.parametrize("cpd", [3.0, 6.0, 11.3])
+def test_the_map_of_a_grating_is_even(transform: Transform, cpd: float) -> None:
+    flat = grating(cpd / PPD, 0.0)
+    inner = metric_of(transform)(grating(cpd / PPD, 0.02), flat)[..., 32:96, 32:96]
+    low, high = inner.quantile(0.05), inner.quantile(0.95)
+    assert 20.0 * torch.log10(high / low) < 0.6
+
+
+@each_overlapping
+def test_scores_about_what_haar_scores(transform: Transform) -> None:
+    # The same coefficients a stimulus, whatever the number of shifts and phases.
+    test, reference = random_images(1, 1, 128, 128), random_images(2, 1, 128, 128)
+    plain = metric_of(Haar()).score(0.3 + 0.02 * test, 0.3 + 0.02 * reference)
+    ours = metric_of(transform).score(0.3 + 0.02 * test, 0.3 + 0.02 * reference)
+    assert 0.7 < (ours / plain).item() < 1.4
