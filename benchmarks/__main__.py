@@ -7,6 +7,7 @@ from pathlib import Path
 
 # Imported when asked for: each has its own needs.
 BENCHMARKS = {
+    "calibrate": "fit the observer to human thresholds; 15 minutes, 1 with --quick",
     "speed": "time and memory beside kornia's SSIM; 6 minutes, 1 with --quick",
     "stability": "hard images in every precision; 1 minute, 10 seconds with --quick",
 }

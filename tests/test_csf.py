@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.reference import calibrated, paper
-from torch_vdm.csf import barten, butterworth, dimming
+from torch_vdm.csf import bandpass, barten, butterworth
 
 
 def tensors(*numbers: float) -> list[torch.Tensor]:
@@ -26,10 +26,17 @@ def test_butterworth_is_the_reference(frequency: float, gain: float, order: floa
     assert actual == pytest.approx(paper.butterworth(frequency, gain, 2.29, order), rel=1e-9)
 
 
-@given(luminance=st.floats(1e-3, 1e6), half=st.floats(0.0, 10.0), exponent=st.floats(0.0, 2.0))
-def test_dimming_is_the_reference(luminance: float, half: float, exponent: float) -> None:
-    actual = dimming(*tensors(luminance, half, exponent)).item()
-    assert actual == pytest.approx(calibrated.luminance_gain(luminance, half, exponent), rel=1e-9)
+@given(octaves=st.floats(-12.0, 6.0), width=st.floats(0.3, 3.0), floor=st.floats(0.0, 1.0))
+def test_bandpass_is_the_reference(octaves: float, width: float, floor: float) -> None:
+    actual = bandpass(*tensors(octaves, width, floor)).item()
+    assert actual == pytest.approx(calibrated.band(octaves, width, floor), rel=1e-9)
+
+
+def test_bandpass_has_a_slope_everywhere() -> None:
+    octaves = torch.linspace(-3.0, 3.0, 7, dtype=torch.float64, requires_grad=True)
+    bandpass(octaves, *tensors(1.3, 0.5)).sum().backward()
+    assert octaves.grad is not None
+    assert octaves.grad.isfinite().all()
 
 
 def test_achromatic_sensitivity_peaks_at_about_4_cpd() -> None:

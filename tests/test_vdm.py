@@ -26,6 +26,15 @@ sizes = st.one_of(
 )
 
 
+def reference_numbers() -> calibrated.CalibratedParameters:
+    """Return the calibrated observer's numbers as the reference takes them."""
+    names = {field.name for field in dataclasses.fields(calibrated.CalibratedParameters)}
+    observer = Observer.calibrated()
+    return calibrated.CalibratedParameters(
+        **{name: value for name, value in vars(observer).items() if name in names}
+    )
+
+
 def reference_map(
     test: NDArray[np.float64],
     reference: NDArray[np.float64],
@@ -36,11 +45,7 @@ def reference_map(
     switches = paper.Effects(**dataclasses.asdict(effects))
     if not observer.signed:
         return paper.jnd_map(test, reference, PPD, switches)
-    names = {field.name for field in dataclasses.fields(calibrated.CalibratedParameters)}
-    numbers = {name: value for name, value in vars(observer).items() if name in names}
-    return calibrated.jnd_map(
-        test, reference, PPD, calibrated.CalibratedParameters(**numbers), switches
-    )
+    return calibrated.jnd_map(test, reference, PPD, reference_numbers(), switches)
 
 
 def torch_map(
@@ -96,6 +101,15 @@ def test_every_choice_of_effects_is_the_reference(observer: Observer, effects: E
     expected = reference_map(test, reference, observer, effects)
     actual = torch_map(test, reference, observer, effects, torch.float64)
     np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-9)
+
+
+@given(size=sizes, kinds=st.tuples(*[st.sampled_from(KINDS)] * 2), seed=st.integers(0, 2**16))
+def test_score_is_the_reference(size: tuple[int, int], kinds: tuple[str, str], seed: int) -> None:
+    test, reference = (make_xyz(kind, *size, seed + n) for n, kind in enumerate(kinds))
+    expected = calibrated.detection_score(test, reference, PPD, reference_numbers())
+    both = (torch.as_tensor(image)[None] for image in (test, reference))
+    actual = VDM(PPD, Display.xyz()).score(*both).item()
+    assert actual == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 def images(batch: int = 2, height: int = 21, width: int = 34) -> tuple[torch.Tensor, torch.Tensor]:

@@ -9,7 +9,7 @@ def attenuation(frequency: Tensor, cutoff: Tensor, exponent: Tensor) -> Tensor:
 
     exp(-(f / cutoff)^exponent) for S, between 0 and 1: the ratio of the S cones' to the luminance
     modulation transfer (Section 2, after Marimont and Wandell 1993); 1 for M and L.
-    ``frequency`` and ``cutoff`` are 0-dim, in cycles/degree; the result is (3,).
+    ``frequency`` (levels,) and ``cutoff`` are in cycles/degree; the result is (levels, 3).
     """
     short = torch.exp(-((frequency / cutoff) ** exponent))
-    return torch.stack((short, torch.ones_like(short), torch.ones_like(short)))
+    return torch.stack((short, torch.ones_like(short), torch.ones_like(short)), -1)

@@ -38,6 +38,25 @@ def barten(frequency: Tensor, luminance: Tensor, size: Tensor) -> Tensor:
     return a * frequency * falling * torch.sqrt(falling * falling + KNEE)
 
 
+# The fitted achromatic sensitivity falls as exp(-(octaves / width)^FLANK) from its peak: between an
+# exponential, which is too pointed, and a parabola, which falls too fast. Status: choice.
+FLANK = 1.5
+
+# Octaves from the peak are held to this, so that their root has a finite slope. Status: choice.
+SMALLEST_OFFSET = 1e-12
+
+
+def bandpass(octaves: Tensor, width: Tensor, floor: Tensor) -> Tensor:
+    """Return a sensitivity relative to its peak, between 0 and 1, ``octaves`` above the peak.
+
+    exp(-(octaves / width)^1.5) over the peak; below it the same curve down to ``floor``, for
+    sensitivity levels off at low frequency.
+    """
+    offset = octaves.abs().clamp_min(SMALLEST_OFFSET) / width
+    falling = torch.exp(-offset * torch.sqrt(offset))
+    return torch.where(octaves > 0.0, falling, floor + (1.0 - floor) * falling)
+
+
 def butterworth(frequency: Tensor, gain: Tensor, cutoff: Tensor, order: Tensor) -> Tensor:
     """Return a chromatic contrast sensitivity, gain / sqrt(1 + (f / cutoff)^(2 order)).
 
@@ -45,8 +64,3 @@ def butterworth(frequency: Tensor, gain: Tensor, cutoff: Tensor, order: Tensor) 
     cycles/degree.
     """
     return gain / torch.sqrt(1.0 + (frequency / cutoff) ** (2.0 * order))
-
-
-def dimming(luminance: Tensor, half: Tensor, exponent: Tensor) -> Tensor:
-    """Return how sensitivity falls with luminance, (1 + half / L)^-exponent, between 0 and 1."""
-    return (1.0 + half / luminance) ** -exponent

@@ -1,6 +1,7 @@
 """The metric as a training loss."""
 
 import math
+from dataclasses import replace
 from typing import Any, Literal, Self
 
 import torch
@@ -8,6 +9,7 @@ from torch import Tensor, nn
 
 from torch_vdm.display import Display
 from torch_vdm.pair import finite_in_both
+from torch_vdm.observer import Observer
 from torch_vdm.vdm import VDM
 
 Reduction = Literal["mean", "sum", "none"]
@@ -16,6 +18,11 @@ Reduction = Literal["mean", "sum", "none"]
 # 300 steps of Adam on its pixels bring a picture back under 1 JND everywhere with room to spare,
 # from noise, from flat grey, black and white, and from a shift by 8 pixels.
 L1 = 240.0
+
+
+# The dark light that the loss's observer sees by, cd/m2: that of a lit room, ten times the eye's own.
+# A step away from black is then not seen at a contrast of hundreds. Status: choice, by experiment.
+DARK_LIGHT = 0.02
 
 
 class VDMLoss(nn.Module):
@@ -34,7 +41,8 @@ class VDMLoss(nn.Module):
     Parameters
     ----------
     ppd, display, options
-        As in `VDM`.
+        As in `VDM`, but that the default observer is the calibrated one in a lit room, with ten
+        times its dark light: else a step away from black would be seen at any contrast.
     l1
         Weight of the L1 term; 0: the metric alone.
     reduction
@@ -59,6 +67,8 @@ class VDMLoss(nn.Module):
             raise ValueError(f'expected reduction "mean", "sum" or "none", got {reduction!r}')
         if not (math.isfinite(l1) and l1 >= 0.0):
             raise ValueError(f"expected a weight l1 of 0 or more, got {l1}")
+        if options.get("observer") is None:
+            options["observer"] = replace(Observer.calibrated(), dark_light=DARK_LIGHT)
         self.metric = VDM(ppd, display, **options)
         self.l1 = l1
         self.reduction = reduction

@@ -22,20 +22,29 @@ class Observer:
     aberration_cutoff, aberration_exponent
         Attenuation of the S cones, exp(-(f / cutoff)^exponent); cutoff in cycles/degree.
     adaptation_luminance
-        The luminance in cd/m2 that sets the contrast sensitivity everywhere; None: the local
-        one, each node's parent's lowpass.
+        The luminance in cd/m2 that sets the contrast sensitivity everywhere, by Barten's formula
+        and without dimming of the chromatic channels; None: the local one, each node's parent's
+        lowpass, and the fitted curve.
     level_gain
         Whether a level's contrast is divided by its wavelet's peak gain.
-    achromatic_gain, achromatic_size
-        Factor on Barten's sensitivity; its target size in degrees. Never the image's size.
-    red_green_gain, yellow_violet_gain
-        Sensitivity of C1 and C2 at low frequency.
-    chromatic_cutoff, chromatic_order
-        Their Butterworth filter; cutoff in cycles/degree.
-    red_green_luminance, red_green_exponent, yellow_violet_luminance, yellow_violet_exponent
-        How they fall in the dark, (1 + luminance / L)^-exponent; luminance in cd/m2.
-    transducer_exponent
-        q of the signed transducer 2^q v (1 + v^2)^-q.
+    achromatic_gain
+        Factor on Barten's sensitivity; or the sensitivity of A at its peak in bright light.
+    achromatic_size
+        Barten's target size in degrees. Never the image's size.
+    dim_luminance, achromatic_dimming, chromatic_dimming
+        How sensitivity falls in the dark, (1 + luminance / L)^-exponent; luminance in cd/m2.
+    glare_luminance, glare_exponent
+        How that of A falls in glare, (1 + L / luminance)^-exponent.
+    peak_frequency, peak_luminance, peak_exponent
+        Where A's sensitivity peaks, frequency (1 + luminance / L)^-exponent; cycles/degree.
+    band_width, band_floor
+        Its width in octaves, to 1/e of the peak; what is left of it far below the peak.
+    red_green_gain, red_green_cutoff, red_green_order
+        C1's Butterworth filter: sensitivity at low frequency, cutoff in cycles/degree, order.
+    yellow_violet_gain, yellow_violet_cutoff, yellow_violet_order
+        C2's.
+    transducer_exponent, transducer_start, transducer_knee
+        q, s and k of `signed_transducer`.
     summation_exponent
         The exponent of the distance summation.
     lowpass_gains
@@ -44,6 +53,8 @@ class Observer:
     score_exponent, score_coefficients
         The detection score: exponent of its Minkowski sum, and the number of coefficients with
         a response of 1 that together score 1 JND.
+    score_window
+        How many nodes of a level, in x and in y, the eye takes together; odd.
     """
 
     name: str
@@ -56,19 +67,30 @@ class Observer:
     level_gain: bool
     achromatic_gain: float
     achromatic_size: float
+    dim_luminance: float
+    achromatic_dimming: float
+    chromatic_dimming: float
+    glare_luminance: float
+    glare_exponent: float
+    peak_frequency: float
+    peak_luminance: float
+    peak_exponent: float
+    band_width: float
+    band_floor: float
     red_green_gain: float
+    red_green_cutoff: float
+    red_green_order: float
     yellow_violet_gain: float
-    chromatic_cutoff: float
-    chromatic_order: float
-    red_green_luminance: float
-    red_green_exponent: float
-    yellow_violet_luminance: float
-    yellow_violet_exponent: float
+    yellow_violet_cutoff: float
+    yellow_violet_order: float
     transducer_exponent: float
+    transducer_start: float
+    transducer_knee: float
     summation_exponent: float
     lowpass_gains: tuple[float, float, float] | None
     score_exponent: float
     score_coefficients: float
+    score_window: int
 
     @classmethod
     def paper(cls) -> Self:
@@ -88,19 +110,33 @@ class Observer:
             level_gain=False,  # printed: no gain
             achromatic_gain=1.0,  # source: Barten 1989
             achromatic_size=12.0,  # degrees, choice
-            red_green_gain=76.0,  # fitted to human thresholds, see docs/model.md
+            # One adaptation luminance and Barten's formula: none of these.
+            dim_luminance=0.0,
+            achromatic_dimming=0.0,
+            chromatic_dimming=0.0,
+            glare_luminance=1.0,
+            glare_exponent=0.0,
+            peak_frequency=1.0,
+            peak_luminance=0.0,
+            peak_exponent=0.0,
+            band_width=1.0,
+            band_floor=0.0,
+            # Fitted to human thresholds, one curve for both: docs/model.md.
+            red_green_gain=76.0,
+            red_green_cutoff=2.29,  # cpd
+            red_green_order=1.09,
             yellow_violet_gain=36.0,
-            chromatic_cutoff=2.29,  # cpd
-            chromatic_order=1.09,
-            red_green_luminance=0.0,  # cd/m2: one adaptation luminance, so no dimming
-            red_green_exponent=0.0,
-            yellow_violet_luminance=0.0,
-            yellow_violet_exponent=0.0,
-            transducer_exponent=0.0,  # of the signed transducer only
+            yellow_violet_cutoff=2.29,
+            yellow_violet_order=1.09,
+            # Of the signed transducer only.
+            transducer_exponent=0.0,
+            transducer_start=1.0,
+            transducer_knee=1.0,
             summation_exponent=2.4,  # printed: Eq. 5
             lowpass_gains=None,  # printed: never compared
-            score_exponent=4.0,
-            score_coefficients=150.0,  # fitted: the median achromatic threshold scores 1
+            score_exponent=4.0,  # the score is not the paper's: choice
+            score_coefficients=150.0,
+            score_window=7,
         )
 
     @classmethod
@@ -110,26 +146,38 @@ class Observer:
             name="calibrated",
             signed=True,  # choice: a grating and its negative differ
             true_means=True,  # choice: else one odd pixel outweighs half of the image
-            dark_light=0.02,  # cd/m2, choice
-            aberration_cutoff=5.24,  # cpd, fitted to a diffraction and defocus model of the eye
+            dark_light=0.002,  # cd/m2, choice: thresholds are known down to 0.0002 cd/m2
+            aberration_cutoff=19.2,  # cpd; its prior, 5.24, is that of a model of the eye
             aberration_exponent=2.15,
             adaptation_luminance=None,  # choice: local, as the eye adapts
             level_gain=True,  # choice: a grating at a level's best frequency has its contrast
-            achromatic_gain=1.0,  # source: Barten 1989
-            achromatic_size=12.0,  # degrees, choice: the map never takes a size
-            red_green_gain=76.0,  # fitted to human thresholds, see docs/model.md
-            yellow_violet_gain=36.0,
-            chromatic_cutoff=2.29,  # cpd, fitted
-            chromatic_order=1.09,  # fitted
-            red_green_luminance=0.7,
-            red_green_exponent=0.2,
-            yellow_violet_luminance=0.7,
-            yellow_violet_exponent=0.2,
-            transducer_exponent=0.4,  # choice: the growth of Eq. 4 far out, r^0.2
+            achromatic_gain=407.0,
+            achromatic_size=12.0,  # degrees; of Barten's formula only
+            dim_luminance=25.1,
+            achromatic_dimming=0.164,
+            chromatic_dimming=0.477,
+            glare_luminance=2000.0,
+            glare_exponent=0.45,
+            peak_frequency=4.06,
+            peak_luminance=300.0,
+            peak_exponent=0.205,
+            band_width=1.2,
+            band_floor=0.473,
+            red_green_gain=422.0,
+            red_green_cutoff=0.294,
+            red_green_order=0.959,
+            yellow_violet_gain=247.0,
+            yellow_violet_cutoff=0.104,
+            yellow_violet_order=0.836,
+            # Choice: Legge and Foley's slope of masking, 0.6, and their dip of 4 to 8 dB.
+            transducer_exponent=0.3,
+            transducer_start=0.2,
+            transducer_knee=2.0,
             summation_exponent=2.4,  # source: Eq. 5
             lowpass_gains=(20.0, 76.0, 36.0),  # choice: a change of the mean by 5 % is 1 JND
-            score_exponent=4.0,
-            score_coefficients=150.0,  # fitted: the median achromatic threshold scores 1
+            score_exponent=1.6,  # choice, by experiment, as the next two
+            score_coefficients=16.0,
+            score_window=7,
         )
 
     def numbers(self) -> dict[str, float]:

@@ -19,50 +19,61 @@ def pad_even(plane: Tensor) -> Tensor:
     return functional.pad(plane, (0, width % 2, 0, height % 2), mode="replicate")
 
 
+def share(side: int, node: int) -> float:
+    """Return the share of its pixels that the last of the nodes of a side of pixels has."""
+    return (side % node or node) / node
+
+
 def complete(plane: Tensor, size: tuple[int, int], node: int) -> Tensor:
-    """Pad ``plane`` to even sides so that no pixel weighs more than another.
+    """Pad ``plane`` to even sides so that no pixel weighs more than another in the details.
 
     ``plane`` (B, C, h, w) holds the means of nodes of ``node`` x ``node`` pixels, a power of two,
     of an image of ``size`` = (H, W) pixels. The last row or column R may hold only the share r of
-    its pixels. As a second sibling, after L, it becomes L + 2 r / (1 + r) (R - L): (L + R) / 2 is
-    then the mean of the real pixels of both. As a first it gets, in the place of the sibling that
-    it lacks, R + 2 r / (1 + r) (L - R), so that its details are those of a window over the border
-    and L, its neighbour. In both the detail tends to 0 with r.
-
-    The lowpass of a window is not that of its node; see `own`.
+    its pixels: it becomes L + r (R - L), as if the pixels that it lacks were like L, the one before
+    it. Where it has no sibling it gets L for one, so that its details are those of a window over
+    the border. The lowpass then is not that of the node's own pixels; see `own`.
     """
     for side, axis in zip(size, (-2, -1), strict=True):
-        nodes = plane.shape[axis]
-        share = (side % node or node) / node
-        if nodes == 1 or (nodes % 2 == 0 and share == 1.0):
+        nodes, real = plane.shape[axis], share(side, node)
+        if nodes == 1 or (nodes % 2 == 0 and real == 1.0):
             continue
         before, last = plane.narrow(axis, nodes - 2, 1), plane.narrow(axis, nodes - 1, 1)
-        step = 2.0 * share / (1.0 + share) * (last - before)
-        if nodes % 2 == 0:
-            plane = torch.cat((plane.narrow(axis, 0, nodes - 1), before + step), axis)
-        else:
-            plane = torch.cat((plane, last - step), axis)
+        columns = [plane.narrow(axis, 0, nodes - 1), before + real * (last - before)]
+        plane = torch.cat([*columns, before] if nodes % 2 == 1 else columns, axis)
     return pad_even(plane)
 
 
-def own(lowpass: Tensor, details: Tensor, size: tuple[int, int]) -> Tensor:
-    """Give the border nodes of a decomposed `complete` plane the mean of their own pixels.
+def own(lowpass: Tensor, plane: Tensor, size: tuple[int, int], node: int) -> Tensor:
+    """Give the border nodes the mean of their own pixels.
 
-    ``lowpass`` (B, C, h / 2, w / 2) and ``details`` (B, C, 3, h / 2, w / 2) are those of Eq. 2;
-    ``size`` is (h, w) before it was completed. The first sibling alone is the sum of the lowpass
-    and the detail.
+    ``lowpass`` (B, C, h / 2, w / 2) is that of Eq. 2 from a `complete` ``plane``, which is given
+    as it was before, (B, C, h, w); ``size`` and ``node`` as there.
     """
-    horizontal, vertical, diagonal = details.unbind(2)
-    if size[1] % 2 == 1:
-        alone = lowpass[..., -1:] + horizontal[..., -1:]
-        lowpass = torch.cat((lowpass[..., :-1], alone), -1)
-        vertical = torch.cat(
-            (vertical[..., -1:, :-1], vertical[..., -1:, -1:] + diagonal[..., -1:, -1:]), -1
-        )
-    if size[0] % 2 == 1:
-        alone = lowpass[..., -1:, :] + vertical[..., -1:, :]
-        lowpass = torch.cat((lowpass[..., :-1, :], alone), -2)
+    for axis, other in ((-1, -2), (-2, -1)):
+        nodes = plane.shape[axis]
+        if nodes == 1 or (nodes % 2 == 0 and share(size[axis], node) == 1.0):
+            continue
+        count = 2 - nodes % 2
+        border = plane.narrow(axis, nodes - count, count)
+        for along in (axis, other):
+            border = _means(border, along, share(size[along], node))
+        inner = lowpass.narrow(axis, 0, lowpass.shape[axis] - 1)
+        lowpass = torch.cat((inner, border), axis)
     return lowpass
+
+
+def _means(plane: Tensor, axis: int, real: float) -> Tensor:
+    """Return the means of pairs of nodes along an axis; the last node has the share ``real``."""
+    nodes = plane.shape[axis]
+    first = plane[..., 0::2] if axis == -1 else plane[..., 0::2, :]
+    second = plane[..., 1::2] if axis == -1 else plane[..., 1::2, :]
+    paired = second.shape[axis]
+    means = 0.5 * (first.narrow(axis, 0, paired) + second)
+    if nodes % 2 == 1:
+        return torch.cat((means, first.narrow(axis, paired, 1)), axis)
+    before, last = first.narrow(axis, paired - 1, 1), second.narrow(axis, paired - 1, 1)
+    weighed = (before + real * last) / (1.0 + real)
+    return torch.cat((means.narrow(axis, 0, paired - 1), weighed), axis)
 
 
 def push(nodes: Tensor, size: tuple[int, int]) -> Tensor:

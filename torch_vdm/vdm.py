@@ -16,9 +16,10 @@ from torch_vdm.contrast import (
     weber_contrast,
 )
 from torch_vdm.cortex import Cortex, Haar, Transform
-from torch_vdm.csf import barten, butterworth, dimming
+from torch_vdm.csf import bandpass, barten, butterworth
 from torch_vdm.display import BT709_TO_XYZ, Display
 from torch_vdm.distance import (
+    SMALLEST_DIFFERENCE,
     accumulate,
     just_noticeable,
     local_visual_difference,
@@ -30,7 +31,7 @@ from torch_vdm.masking import energy_transducer, signed_transducer
 from torch_vdm.matrix import mix
 from torch_vdm.observer import Observer
 from torch_vdm.pair import Nonfinite, PairMetric
-from torch_vdm.pooling import phase_energy, pool, pool_halves, surround, surround_halves
+from torch_vdm.pooling import glance, phase_energy, pool, pool_halves, surround, surround_halves
 from torch_vdm.quadtree import push
 from torch_vdm.sarnoff import Sarnoff
 
@@ -41,13 +42,28 @@ DEEPEST = 24
 LARGEST_AT_ONCE = 2**20
 
 
-class Level(NamedTuple):
-    """What a level of the transform responds to."""
+# A Butterworth filter's parameters.
+FILTER = ("gain", "cutoff", "order")
 
+# q, s and k of the signed transducer.
+Transducer = tuple[Tensor, Tensor, Tensor]
+
+
+class Level(NamedTuple):
+    """What a level of the transform responds to, as far as it does not depend on the image.
+
+    Where there are as many as orientations, one stands for all where all have the same.
+    """
+
+    passed: Tensor
+    """(3,): the share of each cone's details that chromatic aberration leaves."""
     frequency: Tensor
-    """Cycles/degree: the frequency of its best response; one for each orientation or for all."""
+    """As many, in cycles/degree: the frequency of the best response."""
     gain: Tensor
-    """What its contrast is divided by; as many."""
+    """As many: what contrast is divided by."""
+    sensitivity: Tensor
+    """(channels, as many): the contrast sensitivity, over the gain. Where the luminance is local,
+    that of C1 and C2 in bright light."""
 
 
 class VDM(PairMetric):
@@ -152,26 +168,33 @@ class VDM(PairMetric):
     def score(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the detection score of each item, (B,), JND: the image as one stimulus.
 
-        A Minkowski sum of the response differences over all coefficients, so that a larger
-        stimulus is easier to detect, where the map stays local.
+        A Minkowski sum of the response differences over the coefficients that one glance takes
+        in, at the place where it is largest: a larger stimulus is easier to detect, up to some
+        cycles, where the map stays local.
         """
         test, reference, _ = self._checked(test, reference)
         constants = self._constants(test.dtype)
-        exponent = constants["score_exponent"]
+        exponent, coefficients = constants["score_exponent"], constants["score_coefficients"]
         totals = []
         for one, other in self._parts(test, reference):
             first, second = self.represent(one), self.represent(other)
-            total = (self.lowpass_difference(first, second) ** exponent).sum((1, 2, 3))
-            for seen, expected in zip(self.respond(first), self.respond(second), strict=True):
-                total = total + self._scored(seen - expected, exponent)
-            totals.append(total)
-        return just_noticeable(torch.cat(totals) / constants["score_coefficients"], exponent)
+            root = coefficients * self.lowpass_difference(first, second) ** exponent
+            glances = [
+                glance(
+                    self._scored(seen - expected, exponent),
+                    self.observer.score_window,
+                    self.transform.shifts,
+                )
+                for seen, expected in zip(self.respond(first), self.respond(second), strict=True)
+            ]
+            totals.append(accumulate(glances, root.sum(1, keepdim=True)).amax((1, 2, 3)))
+        return just_noticeable(torch.cat(totals) / coefficients, exponent)
 
     def _scored(self, difference: Tensor, exponent: Tensor) -> Tensor:
-        """Return what a level adds to the sum of the score, (B,)."""
+        """Return what each node of a level adds to the sum of the score, (B, 1, h, w)."""
         shifts, phases = self.transform.shifts, self.transform.phases
         if shifts == 1 and phases == 1:
-            return (difference.abs() ** exponent).sum((1, 2, 3, 4))
+            return (difference.abs() ** exponent).sum((1, 2)).unsqueeze(1)
         surrounded = surround_halves(phase_energy(difference, phases), 1)
         energy = pool_halves(pool_halves(surrounded, 1, -1), 1, -2)
         # As many coefficients as nodes side by side would have, and for one phase of a grating
@@ -179,7 +202,7 @@ class VDM(PairMetric):
         half = 0.5 * exponent
         spread = torch.exp(torch.lgamma(half + 0.5) - torch.lgamma(half + 1.0)) / math.sqrt(math.pi)
         weight = spread * 2.0**half / shifts**2
-        return weight * (energy**half).sum((1, 2, 3, 4))
+        return weight * (energy.clamp_min(SMALLEST_DIFFERENCE) ** half).sum((1, 2)).unsqueeze(1)
 
     def represent(self, image: Tensor) -> Cortex:
         """Return the cortex representation of an image: display, cones, transform.
@@ -206,7 +229,7 @@ class VDM(PairMetric):
                 detail,
                 *self._sight(cortex, number, level, constants),
                 constants["opponents"],
-                constants["transducer_exponent"],
+                self._transducer(constants),
                 self.observer.signed,
                 self.effects.masking,
                 self.transform.phases,
@@ -274,7 +297,7 @@ class VDM(PairMetric):
                 other_scale,
                 other_sensitivity[:, :, same],
                 constants["opponents"],
-                constants["transducer_exponent"],
+                self._transducer(constants),
                 self.observer.signed,
                 self.effects.masking,
                 self.transform.phases,
@@ -311,20 +334,47 @@ class VDM(PairMetric):
         parent = cortex.parent_lowpass(number)
         size = (cortex.details[number].shape[-2], cortex.details[number].shape[-1])
         fast = self._fast and parent.numel() >= SMALLEST
-        at_parents = compiled(_scale_and_sensitivity) if fast else _scale_and_sensitivity
-        scale, sensitivity = at_parents(
-            parent, level, constants, self.observer.adaptation_luminance is None, self.effects
-        )
-        if self.observer.adaptation_luminance is None:
-            sensitivity = push(sensitivity, size)
-        return push(scale, size), sensitivity
+        scaled = compiled(_scale) if fast else _scale
+        scale = push(scaled(parent, level.passed, constants["dark_cones"]), size)
+        if self.observer.adaptation_luminance is not None:
+            return scale, level.sensitivity[None, ..., None, None]
+        sensed = compiled(_sensitivity) if fast else _sensitivity
+        return scale, push(sensed(parent, level, constants, self.effects.chromatic), size)
 
     def _levels(self, cortex: Cortex, constants: dict[str, Tensor]) -> list[Level]:
-        """Return what each level of ``cortex`` responds to, level 0 (the coarsest) first."""
+        """Return what each level of ``cortex`` responds to, level 0 (the coarsest) first.
+
+        All levels at once: on small images the operations of a level cost more than its numbers.
+        """
         count = len(cortex.details)
-        frequencies, gains = constants["frequencies"], constants["gains"]
+        if count == 0:
+            return []
+        frequency, gain = (constants[name][:count].flip(0) for name in ("frequencies", "gains"))
+        if self.effects.aberration:
+            passed = attenuation(
+                frequency[:, 0], constants["aberration_cutoff"], constants["aberration_exponent"]
+            )
+        else:
+            passed = torch.ones_like(frequency[:, :1]).expand(-1, 3)
+        channels = []
+        if self.observer.adaptation_luminance is not None:
+            luminance, size = constants["adaptation_luminance"], constants["achromatic_size"]
+            channels = [constants["achromatic_gain"] * barten(frequency, luminance, size)]
+        if self.effects.chromatic:
+            channels += [
+                butterworth(frequency, *(constants[f"{name}_{part}"] for part in FILTER))
+                for name in ("red_green", "yellow_violet")
+            ]
+        bright = torch.stack(channels, 1) / gain.unsqueeze(1) if channels else gain.unsqueeze(1)
         # Copies, for compiled code is specialised on the offset of a view.
-        return [Level(frequencies[n].clone(), gains[n].clone()) for n in reversed(range(count))]
+        columns = [[row.clone() for row in part] for part in (passed, frequency, gain, bright)]
+        return [Level(*row) for row in zip(*columns, strict=True)]
+
+    def _transducer(self, constants: dict[str, Tensor]) -> Transducer:
+        exponent, start, knee = (
+            constants[f"transducer_{part}"] for part in ("exponent", "start", "knee")
+        )
+        return exponent, start, knee
 
 
 def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) -> Tensor:
@@ -337,7 +387,7 @@ def _response(
     scale: Tensor,
     sensitivity: Tensor,
     matrix: Tensor,
-    exponent: Tensor,
+    transducer: Transducer,
     signed: bool,
     masking: bool,
     phases: int,
@@ -346,7 +396,7 @@ def _response(
     contrast = opponents(local_contrast(details, scale), matrix)
     weighted = contrast * sensitivity
     if signed:
-        return signed_transducer(weighted, exponent, phases) if masking else weighted
+        return signed_transducer(weighted, *transducer, phases) if masking else weighted
     return energy_transducer(weighted * weighted) if masking else weighted.abs()
 
 
@@ -358,7 +408,7 @@ def _response_difference(
     other_scale: Tensor,
     other_sensitivity: Tensor,
     matrix: Tensor,
-    exponent: Tensor,
+    transducer: Transducer,
     signed: bool,
     masking: bool,
     phases: int,
@@ -368,58 +418,37 @@ def _response_difference(
     Each image by itself: equal images then take equal paths through the vectorised loops, and
     their difference is exactly 0.
     """
-    response = _response(details, scale, sensitivity, matrix, exponent, signed, masking, phases)
+    response = _response(details, scale, sensitivity, matrix, transducer, signed, masking, phases)
     other = _response(
-        other_details, other_scale, other_sensitivity, matrix, exponent, signed, masking, phases
+        other_details, other_scale, other_sensitivity, matrix, transducer, signed, masking, phases
     )
     return (response - other).abs() if signed else response - other
 
 
-def _scale_and_sensitivity(
-    parent: Tensor, level: Level, constants: dict[str, Tensor], local: bool, effects: Effects
-) -> tuple[Tensor, Tensor]:
-    """Return what `VDM._sight` pushes to the nodes, on the plane of their parents."""
-    scale = adapted(parent, constants["dark_cones"]).reciprocal()
-    if effects.aberration:
-        passed = attenuation(
-            level.frequency[0], constants["aberration_cutoff"], constants["aberration_exponent"]
-        )
-        scale = scale * passed.view(3, 1, 1)
-    if local:
-        seen = mix(constants["luminance_of_cones"], parent).clamp_min(0.0)
-        luminance = seen + constants["dark_light"]
-    else:
-        luminance = constants["adaptation_luminance"].view(1, 1, 1, 1)
-    sensitivities = [
-        _sensitivity(luminance, frequency, gain, constants, effects)
-        for frequency, gain in zip(level.frequency, level.gain, strict=True)
-    ]
-    return scale, torch.stack(sensitivities, 2)
+def _scale(parent: Tensor, passed: Tensor, dark_cones: Tensor) -> Tensor:
+    """Return what turns details into contrasts, at their parents."""
+    return passed.view(3, 1, 1) / adapted(parent, dark_cones)
 
 
 def _sensitivity(
-    luminance: Tensor,
-    frequency: Tensor,
-    gain: Tensor,
-    constants: dict[str, Tensor],
-    effects: Effects,
+    parent: Tensor, level: Level, constants: dict[str, Tensor], chromatic: bool
 ) -> Tensor:
-    """Return the contrast sensitivity of every channel, (B, channels, h, w), at a level."""
-    achromatic = constants["achromatic_gain"] * barten(
-        frequency, luminance, constants["achromatic_size"]
-    )
-    channels = [achromatic]
-    if effects.chromatic:
-        for name in ("red_green", "yellow_violet"):
-            bright = butterworth(
-                frequency,
-                constants[f"{name}_gain"],
-                constants["chromatic_cutoff"],
-                constants["chromatic_order"],
-            )
-            dim = dimming(luminance, constants[f"{name}_luminance"], constants[f"{name}_exponent"])
-            channels.append(bright * dim)
-    return torch.cat(channels, 1) / gain
+    """Return the contrast sensitivity in the local luminance, at the parents."""
+    seen = mix(constants["luminance_of_cones"], parent).clamp_min(0.0)
+    luminance = (seen + constants["dark_light"]).unsqueeze(2)
+    dark = torch.log2(1.0 + constants["dim_luminance"] / luminance)
+    glare = torch.log2(1.0 + luminance / constants["glare_luminance"])
+    faint = torch.log2(1.0 + constants["peak_luminance"] / luminance)
+    relative = torch.log2(level.frequency / constants["peak_frequency"]).view(-1, 1, 1)
+    octaves = relative + constants["peak_exponent"] * faint
+    dimmed = constants["achromatic_dimming"] * dark + constants["glare_exponent"] * glare
+    shape = bandpass(octaves, constants["band_width"], constants["band_floor"])
+    gain = constants["achromatic_gain"] / level.gain.view(-1, 1, 1)
+    achromatic = gain * shape * torch.exp2(-dimmed)
+    if not chromatic:
+        return achromatic
+    dim = torch.exp2(-constants["chromatic_dimming"] * dark)
+    return torch.cat((achromatic, level.sensitivity[..., None, None] * dim), 1)
 
 
 def _pooled_energy(surrounded: Tensor, nodes: int, exponent: Tensor) -> Tensor:

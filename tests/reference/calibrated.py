@@ -1,10 +1,11 @@
 """The calibrated observer: the pipeline of ``paper`` with other stages where data asked for them.
 
 What is not here is the paper's own, imported: Eq. 1 to 3, the wavelet's frequencies, the shape of
-the aberration, local contrast, Barten's formula, the Butterworth filter, the 3x3 box, Eq. 5 and the
+the aberration, local contrast, the Butterworth filter, the 3x3 box, Eq. 5 and the
 path sums. All numbers are arguments. Shapes, orders and units as in ``paper``.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,6 @@ from .paper import (
     Array,
     Effects,
     Pyramid,
-    barten,
     butterworth,
     chromatic_aberration,
     cone_dark_light,
@@ -44,40 +44,58 @@ class CalibratedParameters:
         The eye's dark light, cd/m2.
     aberration_cutoff, aberration_exponent
         Of exp(-(f/cutoff)^exponent); cycles/degree and no unit.
-    achromatic_gain, achromatic_size
-        Factor on Barten's formula, no unit, and its w, degrees.
-    red_green_gain, yellow_violet_gain
-        Butterworth sensitivity of C1 and C2 at 0 cycles/degree, 1/contrast.
-    chromatic_cutoff, chromatic_order
-        Butterworth fc, cycles/degree, and n, no unit, of C1 and C2.
-    red_green_luminance, red_green_exponent
-        L0, cd/m2, and p, no unit, of (1 + L0/Lum)^(-p) for C1.
-    yellow_violet_luminance, yellow_violet_exponent
+    achromatic_gain
+        Sensitivity of A at its peak, 1/contrast.
+    dim_luminance, achromatic_dimming, chromatic_dimming
+        L0, cd/m2, and p, no unit, of (1 + L0/Lum)^(-p), for A and for C1 and C2.
+    glare_luminance, glare_exponent
+        Lg, cd/m2, and p, no unit, of (1 + Lum/Lg)^(-p) for A.
+    peak_frequency, peak_luminance, peak_exponent
+        f0, cycles/degree, L1, cd/m2, and r, no unit, of A's peak f0 (1 + L1/Lum)^(-r).
+    band_width, band_floor
+        w, octaves, and what is left far below the peak, no unit.
+    red_green_gain, red_green_cutoff, red_green_order
+        Butterworth sensitivity of C1 at 0 cycles/degree, 1/contrast; fc, cycles/degree; n.
+    yellow_violet_gain, yellow_violet_cutoff, yellow_violet_order
         The same for C2.
-    transducer_exponent
-        q of the signed transducer; no unit.
+    transducer_exponent, transducer_start, transducer_knee
+        q, s, k of the signed transducer; no unit.
     summation_exponent
         In the place of Eq. 5's 2.4; no unit.
     lowpass_gains
         Sensitivity of A, C1, C2 to the root lowpass, 1/contrast.
+    score_exponent, score_coefficients, score_window
+        Of the detection score; the window in nodes.
     """
 
     dark_light: float
     aberration_cutoff: float
     aberration_exponent: float
     achromatic_gain: float
-    achromatic_size: float
+    dim_luminance: float
+    achromatic_dimming: float
+    chromatic_dimming: float
+    glare_luminance: float
+    glare_exponent: float
+    peak_frequency: float
+    peak_luminance: float
+    peak_exponent: float
+    band_width: float
+    band_floor: float
     red_green_gain: float
+    red_green_cutoff: float
+    red_green_order: float
     yellow_violet_gain: float
-    chromatic_cutoff: float
-    chromatic_order: float
-    red_green_luminance: float
-    red_green_exponent: float
-    yellow_violet_luminance: float
-    yellow_violet_exponent: float
+    yellow_violet_cutoff: float
+    yellow_violet_order: float
     transducer_exponent: float
+    transducer_start: float
+    transducer_knee: float
     summation_exponent: float
     lowpass_gains: tuple[float, float, float]
+    score_exponent: float
+    score_coefficients: float
+    score_window: int
 
 
 @dataclass(frozen=True)
@@ -118,11 +136,11 @@ def block(n: int, node: int, side: int) -> slice:
 def border_window(plane: Array, node: int, side: int) -> Array:
     """Make the number of columns of ``plane`` even, and the last detail that of real pixels.
 
-    Where the last column R has b of its a = ``node`` pixels and the one before it, L, has all:
+    The last column R has b of its a = ``node`` pixels, and the one before it, L, has all. The
+    pixels that R lacks are taken to be like L. Then, with
 
-    - an even number: the detail is b (L - R) / (a + b) and the lowpass (a L + b R) / (a + b), the
-      mean of the pixels of both. R is replaced by what makes Eq. 2 give both;
-    - an odd number: R has no sibling. L is its partner, and the detail is b (R - L) / (a + b);
+    - an even number of columns: nothing more, L is its sibling;
+    - an odd number: R has no sibling, and L is its partner;
     - one column: repeated.
 
     Parameters
@@ -132,17 +150,15 @@ def border_window(plane: Array, node: int, side: int) -> Array:
     node, side
         Pixels in a whole column of ``plane``, and in the image's row.
     """
-    height, width = plane.shape
+    width = plane.shape[1]
     if width == 1:
         return np.concatenate((plane, plane), axis=1)
     pixels = block(width - 1, node, side)
     b = pixels.stop - pixels.start
     columns = [plane[:, x].copy() for x in range(width)]
-    left, right = columns[-2], columns[-1]
-    if width % 2 == 0:
-        columns[-1] = 2 * (node * left + b * right) / (node + b) - left
-    else:
-        columns.append(right - 2 * b * (right - left) / (node + b))
+    columns[-1] = ((node - b) * columns[-2] + b * columns[-1]) / node
+    if width % 2 == 1:
+        columns.append(columns[-2])
     return np.stack(columns, axis=1)
 
 
@@ -209,7 +225,7 @@ def local_luminance(pyramid: Pyramid, level: int, dark_light: float) -> Array:
 
 
 def luminance_gain(luminance: float, knee: float, exponent: float) -> float:
-    """Part of a chromatic sensitivity left at ``luminance``, (1 + knee/luminance)^(-exponent).
+    """Part of a sensitivity left at ``luminance``, (1 + knee/luminance)^(-exponent).
 
     Parameters
     ----------
@@ -221,6 +237,15 @@ def luminance_gain(luminance: float, knee: float, exponent: float) -> float:
         p, no unit.
     """
     return float((1 + knee / luminance) ** -exponent)
+
+
+def band(octaves: float, width: float, floor: float) -> float:
+    """Shape of A's sensitivity ``octaves`` above its peak, 1 at the peak.
+
+    exp(-(abs(octaves)/width)^1.5); below the peak ``floor`` + (1 - ``floor``) times it.
+    """
+    falling = math.exp(-((abs(octaves) / width) ** 1.5))
+    return falling if octaves > 0 else floor + (1 - floor) * falling
 
 
 def sensitivity(
@@ -238,12 +263,16 @@ def sensitivity(
         The observer's numbers.
     """
     p = parameters
+    peak = p.peak_frequency * luminance_gain(luminance, p.peak_luminance, p.peak_exponent)
+    bright = (
+        luminance_gain(luminance, p.dim_luminance, p.achromatic_dimming)
+        * (1 + luminance / p.glare_luminance) ** -p.glare_exponent
+    )
+    dim = luminance_gain(luminance, p.dim_luminance, p.chromatic_dimming)
     return (
-        p.achromatic_gain * barten(f, luminance, p.achromatic_size),
-        butterworth(f, p.red_green_gain, p.chromatic_cutoff, p.chromatic_order)
-        * luminance_gain(luminance, p.red_green_luminance, p.red_green_exponent),
-        butterworth(f, p.yellow_violet_gain, p.chromatic_cutoff, p.chromatic_order)
-        * luminance_gain(luminance, p.yellow_violet_luminance, p.yellow_violet_exponent),
+        p.achromatic_gain * bright * band(math.log2(f / peak), p.band_width, p.band_floor),
+        butterworth(f, p.red_green_gain, p.red_green_cutoff, p.red_green_order) * dim,
+        butterworth(f, p.yellow_violet_gain, p.yellow_violet_cutoff, p.yellow_violet_order) * dim,
     )
 
 
@@ -286,9 +315,10 @@ def csf_filtering(
 # Masking transducer
 
 
-def transducer(v: float, exponent: float) -> float:
-    """Signed, for Eq. 4: psi(v) = 2^q v (1 + v^2)^(-q), q = ``exponent``; psi(1) = 1."""
-    return float(2**exponent * v * (1 + v**2) ** -exponent)
+def transducer(v: float, exponent: float, start: float, knee: float) -> float:
+    """Signed, for Eq. 4: psi(v) = c v (s + v^2) / (k + v^2)^(1 + q), psi(1) = 1."""
+    c = (knee + 1) ** (1 + exponent) / (start + 1)
+    return float(c * v * (start + v**2) / (knee + v**2) ** (1 + exponent))
 
 
 def masking_transducer(
@@ -309,7 +339,12 @@ def masking_transducer(
         return weighted
     response = np.zeros(weighted.shape)
     for at in np.ndindex(weighted.shape):
-        response[at] = transducer(float(weighted[at]), parameters.transducer_exponent)
+        response[at] = transducer(
+            float(weighted[at]),
+            parameters.transducer_exponent,
+            parameters.transducer_start,
+            parameters.transducer_knee,
+        )
     return response
 
 
@@ -465,3 +500,45 @@ def jnd_map(
     total = sum_down_paths(lvd, height, width)
     total += lowpass_term(test, reference, effects, parameters)
     return np.asarray(total ** (1 / parameters.summation_exponent))
+
+
+def glance_weight(offset: float, window: int) -> float:
+    """Weight of a node ``offset`` nodes from the middle of a glance, along one axis."""
+    return max(0.0, 1 - abs(offset) / window)
+
+
+def detection_score(
+    test_xyz: Array, reference_xyz: Array, ppd: float, parameters: CalibratedParameters
+) -> float:
+    """Detection score of an image as one stimulus, JND; arguments as in `jnd_map`.
+
+    Around every node of a level the powers of the response differences are summed, with weights
+    that fall linearly over ``score_window`` nodes; these sums are added down the paths of the
+    quad-tree, and the leaf with the largest total tells.
+    """
+    p = parameters
+    test = represent(test_xyz, ppd, p)
+    reference = represent(reference_xyz, ppd, p)
+    r1 = respond(test, ppd, p).response
+    r2 = respond(reference, ppd, p).response
+    glances = []
+    for one, other in zip(r1, r2, strict=True):
+        power = (np.abs(one - other) ** p.score_exponent).sum((0, 1))
+        height, width = power.shape
+        total = np.zeros((height, width))
+        for y, x in np.ndindex(height, width):
+            for v, u in np.ndindex(height, width):
+                weight = glance_weight(y - v, p.score_window) * glance_weight(x - u, p.score_window)
+                total[y, x] += weight * power[v, u]
+        glances.append(total)
+    _, height, width = test_xyz.shape
+    leaves = sum_down_paths(tuple(glances), height, width)
+    contrast = lowpass_contrast(
+        test.lowpass[-1].mean((1, 2)), reference.lowpass[-1].mean((1, 2)), p.dark_light
+    )
+    opponent = opponents(contrast[None, :, None, None], ALL_ON)[0, :, 0, 0]
+    lowpass = sum(
+        abs(gain * value) ** p.score_exponent
+        for gain, value in zip(p.lowpass_gains, opponent, strict=True)
+    )
+    return float((leaves.max() / p.score_coefficients + lowpass) ** (1 / p.score_exponent))

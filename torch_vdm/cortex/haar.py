@@ -37,9 +37,9 @@ class Haar:
         while max(planes.shape[-2:]) > 1:
             step = compiled(_analyse) if fast and planes.numel() >= SMALLEST else _analyse
             if true_means:
-                nodes = (planes.shape[-2], planes.shape[-1])
-                planes, detail = step(complete(planes, size, 2 ** len(details)))
-                planes = own(planes, detail, nodes)
+                node = 2 ** len(details)
+                mean_of_all, detail = step(complete(planes, size, node))
+                planes = own(mean_of_all, planes, size, node)
             else:
                 planes, detail = step(pad_even(planes))
             details.append(detail)

@@ -72,7 +72,7 @@ class StationaryHaar:
 def _faded(parts: Tensor, size: tuple[int, int], node: int) -> Tensor:
     """Weaken a last row or column that has only a share r of its pixels.
 
-    As in `torch_vdm.quadtree.complete`: R becomes L + 2 r / (1 + r) (R - L), where L is its
+    R becomes L + 2 r / (1 + r) (R - L), where L is its
     neighbour, so that (L + R) / 2 is the mean of the real pixels of both.
     """
     for side, axis in zip(size, (-2, -1), strict=True):
