@@ -170,7 +170,9 @@ def test_a_grating_is_less_visible_on_a_busy_texture(observer: Observer) -> None
     added = grating(4.0, 0.05) - grating(4.0, 0.0)
     flat = grating(4.0, 0.0)
     metric = linear_metric(observer)
-    assert metric(texture + added, texture).mean() < 0.7 * metric(flat + added, flat).mean()
+    # The printed transducer masks more than people do; the calibrated one as they do.
+    share = 0.9 if observer.signed else 0.7
+    assert metric(texture + added, texture).mean() < share * metric(flat + added, flat).mean()
 
 
 @each_observer
