@@ -217,7 +217,7 @@ def test_an_even_shift_shifts_the_map(transform: Transform) -> None:
         shifted = torch.roll(flat + window * fine, (shift, shift), (2, 3))
         difference = torch.roll(seen, (shift, shift), (2, 3)) - metric(shifted, flat)
         inner = slice(32, 96), slice(32, 96)
-        return (difference[0, 0][inner].abs().mean() / seen[0, 0][inner].mean()).item()
+        return float(difference[0, 0][inner].abs().mean() / seen[0, 0][inner].mean())
 
     assert moved_by(transform, 8) < 0.02
     assert moved_by(transform, 2) < 0.5 * moved_by(Haar(), 2)
