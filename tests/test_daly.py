@@ -40,7 +40,7 @@ def test_the_sensitivity_is_the_formula() -> None:
         a = 0.801 * (1.0 + 0.7 / 100.0) ** -0.2
         b = 0.3 * 2.0**0.15
         size = float(((3.23 * (rho**2 * 4.0) ** -0.3) ** 5 + 1.0) ** -0.2)
-        rise = a * 0.9 * rho * math.exp(-b * 0.9 * rho)
+        rise = float(a) * 0.9 * rho * math.exp(-b * 0.9 * rho)
         return size * rise * math.sqrt(1.0 + 0.06 * math.exp(b * 0.9 * rho))
 
     expected = 250.0 * min(curve(4.0 / (0.856 * 0.5**0.14)), curve(4.0))
