@@ -301,6 +301,14 @@ def test_the_compiled_route_is_the_same(transform: Transform) -> None:
 
 
 @each_overlapping
+def test_is_one_graph(transform: Transform) -> None:
+    metric = VDM(PPD, transform=transform)
+    test, reference = random_images(1, 1, 5, 6), random_images(2, 1, 5, 6)
+    graph = torch.compile(metric, fullgraph=True, backend="eager")
+    torch.testing.assert_close(graph(test, reference), metric(test, reference))
+
+
+@each_overlapping
 def test_large_planes_in_parts_are_the_same(
     transform: Transform, monkeypatch: pytest.MonkeyPatch
 ) -> None:
