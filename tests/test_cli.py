@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torch_vdm import VDM, Display, __version__
+from torch_vdm import VDM, Display, StationaryHaar, Steerable, __version__
 from torch_vdm.cli import main
 from torch_vdm.io import read_image, write_image
 
@@ -254,3 +254,27 @@ def test_jnd_falls_with_samples_per_pixel(
         for key in ("max_jnd", "mean_jnd", "p95_jnd", "score_jnd"):
             values = [float(str(told[key])) for told in means]
             assert values[0] > values[1] > values[2], (scene.name, key)
+
+
+@pytest.mark.parametrize(
+    ("accuracy", "transform"), [("standard", StationaryHaar()), ("reference", Steerable())]
+)
+def test_accuracy_is_the_transform(
+    pair: Pair,
+    accuracy: str,
+    transform: StationaryHaar | Steerable,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    told = run_json(capsys, *pair, "--accuracy", accuracy)
+    reference, test = (read_image(path)[None] for path in pair)
+    metric = VDM(60.0, transform=transform)
+    assert told["accuracy"] == accuracy
+    assert told["max_jnd"] == pytest.approx(metric(test, reference).max().item())
+    assert told["score_jnd"] == pytest.approx(metric.score(test, reference).item())
+    assert f"--accuracy {accuracy}" in str(told["reproduce"])
+
+
+def test_an_unknown_accuracy_is_refused(pair: Pair, capsys: pytest.CaptureFixture[str]) -> None:
+    told = one_line_error(capsys, "compare", *pair, "--accuracy", "best")
+    assert "fast" in told
+    assert "reference" in told

@@ -125,6 +125,13 @@ def test_the_compiled_route_is_the_same() -> None:
     torch.testing.assert_close(metric.compile()(test, reference), expected, rtol=1e-4, atol=1e-4)
 
 
+def test_is_one_graph() -> None:
+    metric = VDM.sarnoff(60.0)
+    test, reference = random_images(1, 1, 5, 6), random_images(2, 1, 5, 6)
+    graph = torch.compile(metric, fullgraph=True, backend="eager")
+    torch.testing.assert_close(graph(test, reference), metric(test, reference))
+
+
 def test_large_images_in_bands_of_rows_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     metric = VDM.sarnoff(60.0, resample=False)
     test, reference = random_images(1).double(), random_images(2).double()

@@ -155,15 +155,17 @@ def test_is_linear(transform: Transform) -> None:
 @pytest.mark.parametrize("angle", [0.0, 90.0])
 def test_a_grating_lands_in_its_level(transform: Transform, level: int, angle: float) -> None:
     best, _ = transform.peaks(level)[0]
-    metric = metric_of(transform)
-    responses = metric.respond(metric.represent(grating(best, 0.05, 0.4, angle)))
-    energy = [details[:, 0].square().mean().item() for details in reversed(responses)]
-    assert energy.index(max(energy)) == level
+    details = transform.decompose(grating(best, 1.0, 0.4, angle)).details[::-1]
+    energies = []
+    for finer, planes in enumerate(details):
+        gain = transform.peaks(finer)[0][1]
+        pairs = planes[0, 0].square().mean((1, 2)).unflatten(0, (-1, transform.phases)).sum(1)
+        energies.append(pairs / gain**2)
+    strongest = torch.stack(energies).sum(1)
+    assert strongest.argmax() == level
     # And in its orientation: d1 or 0 degrees, d2 or 90.
-    planes = list(reversed(responses))[level][0, 0].square().mean((1, 2))
-    pairs = planes.unflatten(0, (-1, transform.phases)).sum(1)
     upright = 0 if angle == 0.0 else 1 if isinstance(transform, Haar | StationaryHaar) else 2
-    assert pairs.argmax() == upright
+    assert energies[level].argmax() == upright
 
 
 def test_every_shift_of_a_node_is_a_haar_decomposition() -> None:
@@ -200,18 +202,25 @@ def test_a_shift_of_the_image_shifts_a_level(transform: Transform, level: int) -
 
 @each_overlapping
 def test_an_even_shift_shifts_the_map(transform: Transform) -> None:
-    # A fine texture: what is seen lies in the levels whose nodes the shift moves by whole nodes.
+    # A fine texture: what is seen lies in levels whose nodes the shift of 8 moves by whole ones.
     generator = torch.Generator().manual_seed(3)
     noise = torch.randn(1, 1, 128, 128, generator=generator)
     fine = (noise - torch.nn.functional.avg_pool2d(noise, 5, 1, 2)).expand(1, 3, 128, 128)
     flat = torch.full((1, 3, 128, 128), 0.5)
     window = torch.zeros(128, 128)
     window[48:80, 48:80] = 0.02
-    metric = VDM(16.0, Display.linear(200.0), transform=transform)
-    seen = metric(flat + window * fine, flat)
-    moved = metric(torch.roll(flat + window * fine, (4, 4), (2, 3)), flat)
-    difference = (torch.roll(seen, (4, 4), (2, 3)) - moved)[..., 32:96, 32:96]
-    assert difference.abs().mean() < 0.01 * seen[..., 32:96, 32:96].mean()
+
+    def moved_by(transform: Transform, shift: int) -> float:
+        """Return how much the map of a shifted texture differs from the shifted map, relative."""
+        metric = VDM(16.0, Display.linear(200.0), transform=transform)
+        seen = metric(flat + window * fine, flat)
+        shifted = torch.roll(flat + window * fine, (shift, shift), (2, 3))
+        difference = torch.roll(seen, (shift, shift), (2, 3)) - metric(shifted, flat)
+        inner = slice(32, 96), slice(32, 96)
+        return float(difference[0, 0][inner].abs().mean() / seen[0, 0][inner].mean())
+
+    assert moved_by(transform, 8) < 0.02
+    assert moved_by(transform, 2) < 0.5 * moved_by(Haar(), 2)
 
 
 @each
@@ -230,7 +239,7 @@ def test_the_batch_does_not_matter(transform: Transform) -> None:
 @pytest.mark.parametrize(
     "observer", [Observer.paper(), Observer.calibrated()], ids=lambda o: o.name
 )
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(
     seed=st.integers(0, 99),
     height=st.integers(1, 40),
@@ -292,6 +301,14 @@ def test_the_compiled_route_is_the_same(transform: Transform) -> None:
 
 
 @each_overlapping
+def test_is_one_graph(transform: Transform) -> None:
+    metric = VDM(PPD, transform=transform)
+    test, reference = random_images(1, 1, 5, 6), random_images(2, 1, 5, 6)
+    graph = torch.compile(metric, fullgraph=True, backend="eager")
+    torch.testing.assert_close(graph(test, reference), metric(test, reference))
+
+
+@each_overlapping
 def test_large_planes_in_parts_are_the_same(
     transform: Transform, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -303,34 +320,30 @@ def test_large_planes_in_parts_are_the_same(
     torch.testing.assert_close(metric(test, reference), expected, rtol=1e-12, atol=1e-12)
 
 
-def threshold(metric: VDM, cycles: float, phase: float, angle: float = 0.0) -> float:
-    """Return the contrast, dB, at which a grating scores 1 JND: there the score is linear."""
-    contrast = 0.002
-    flat = grating(cycles, 0.0)
-    for _ in range(4):
-        contrast /= metric.score(grating(cycles, contrast, phase, angle), flat).item()
-    return 20.0 * math.log10(contrast)
+def thresholds(metric: VDM, cpd: float, angles: list[float]) -> Tensor:
+    """Return the contrasts, dB, at which gratings of angles and of four phases score 1 JND."""
+    contrast = torch.full((len(angles), 4), 0.002, dtype=torch.float64)
+    flat = grating(cpd / PPD, 0.0).expand(contrast.numel(), -1, -1, -1)
+    phases = [step * math.pi / 4.0 for step in range(4)]
+    unit = torch.cat([grating(cpd / PPD, 1.0, p, a) for a in angles for p in phases])
+    for _ in range(3):
+        test = flat + contrast.view(-1, 1, 1, 1) * (unit - flat)
+        contrast = contrast / metric.score(test, flat).view_as(contrast)
+    return 20.0 * torch.log10(contrast)
 
 
 @each_overlapping
 @pytest.mark.parametrize("cpd", [2.0, 4.0, 8.0])
 def test_the_threshold_hardly_depends_on_phase(transform: Transform, cpd: float) -> None:
     # Frequencies that the grid of nodes divides, the worst: Haar's spread is 3 dB and more.
-    metric = metric_of(transform)
-    phases = [step * math.pi / 4.0 for step in range(4)]
-    thresholds = [threshold(metric, cpd / PPD, phase) for phase in phases]
-    assert max(thresholds) - min(thresholds) < 1.0
+    (found,) = thresholds(metric_of(transform), cpd, [0.0])
+    assert found.max() - found.min() < 1.0
 
 
 @each_overlapping
-@pytest.mark.parametrize("cpd", [2.0, 3.0, 5.0, 8.0])
+@pytest.mark.parametrize("cpd", [2.0, 5.0, 8.0])
 def test_the_threshold_hardly_depends_on_orientation(transform: Transform, cpd: float) -> None:
-    metric = metric_of(transform)
-    phases = [step * math.pi / 4.0 for step in range(4)]
-    straight, turned = (
-        sum(threshold(metric, cpd / PPD, phase, angle) for phase in phases) / len(phases)
-        for angle in (0.0, 45.0)
-    )
+    straight, turned = thresholds(metric_of(transform), cpd, [0.0, 45.0]).mean(1)
     assert abs(straight - turned) < 1.0
 
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torch_vdm import __version__
+from torch_vdm.cortex import Haar, StationaryHaar, Steerable, Transform
 from torch_vdm.display import (
     BT709_TO_XYZ,
     Display,
@@ -36,6 +37,13 @@ DONE, EXCEEDED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 # 27-inch screen of 3840 x 2160 from 0.53 m; 100 cd/m2 is the white of BT.1886 and Display.srgb.
 PPD = 60.0
 WHITE = 100.0
+
+# How the image is decomposed: what accuracy costs.
+TRANSFORMS: dict[str, type[Transform]] = {
+    "fast": Haar,
+    "standard": StationaryHaar,
+    "reference": Steerable,
+}
 
 OBSERVERS = {"calibrated": Observer.calibrated, "paper": Observer.paper}
 
@@ -127,7 +135,13 @@ def _add_options(parser: argparse.ArgumentParser, map_path: Path | None) -> None
         "--exposure", type=_stops, default=0.0, metavar="STOPS", help="multiply the light by 2^F"
     )
     model = parser.add_argument_group("model")
-    model.add_argument("--accuracy", choices=("fast",), default="fast")
+    model.add_argument(
+        "--accuracy",
+        choices=tuple(TRANSFORMS),
+        default="fast",
+        help="fast: the paper's Haar transform (default); standard: its shifts averaged, no "
+        "blocks; reference: oriented quadrature pairs, no phase",
+    )
     model.add_argument("--observer", choices=tuple(OBSERVERS), default="calibrated")
     reading = parser.add_argument_group("reading")
     reading.add_argument("--part", metavar="NAME", help="part of a multi-part EXR, name or number")
@@ -178,7 +192,8 @@ def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
     _check_outputs((reference, test), options)
     ppd, seen_from = _viewing(options)
     pair = _load_pair(reference, test, options)
-    metric = VDM(ppd, pair.display, OBSERVERS[options.observer]())
+    transform = TRANSFORMS[options.accuracy]()
+    metric = VDM(ppd, pair.display, OBSERVERS[options.observer](), transform)
     start = time.perf_counter()
     with torch.no_grad():
         batch = pair.test[None], pair.reference[None]

@@ -85,7 +85,7 @@ class VDM(PairMetric):
     observer
         Who looks; `Observer.calibrated()` by default.
     transform
-        How the image is decomposed; `Haar()` by default.
+        How the image is decomposed: `Haar()`, the default, `StationaryHaar()` or `Steerable()`.
     effects
         What is simulated; everything by default.
     nonfinite

@@ -1,7 +1,7 @@
 """A pyramid of oriented quadrature pairs: no phase, no place and no direction is preferred."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -17,6 +17,9 @@ from torch_vdm.fast import SMALLEST
 # The image half-way between its pixels, which the finest level needs: a sinc of so many taps on
 # either side, under a Hann window. Status: choice.
 HALFWAY = 8
+
+# Levels that peaks are found for: an image of 2^24 pixels a side.
+DEEPEST = 24
 
 # Planes with more numbers are filtered in bands of rows, which stay in the processor's cache.
 # Status: choice, measured.
@@ -58,6 +61,12 @@ class Steerable:
     shifts = 2
     phases = 2
 
+    _peaks: tuple[Peak, ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Find the peaks once: a graph of torch.compile takes them as they are."""
+        object.__setattr__(self, "_peaks", tuple(_peak(level) for level in range(DEEPEST)))
+
     def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:  # noqa: ARG002
         """Decompose (B, C, H, W) to the coarsest level, by compiled steps if ``fast``.
 
@@ -80,7 +89,8 @@ class Steerable:
             size = (plane.shape[-2], plane.shape[-1])
             # The nodes lie between those of the next finer level: at the odd ones of the doubled
             # image, the even ones but the first of all others.
-            details.append(_responses(band, size, 1 if level == 0 else 2, level, fast))
+            peak = self._peaks[level]
+            details.append(_responses(band, size, 1 if level == 0 else 2, peak, fast))
             smooth = blur(plane, fast)
             lowpass.append(_next(smooth))
             band, plane = plane - smooth, smooth[..., ::2, ::2].contiguous()
@@ -88,7 +98,7 @@ class Steerable:
 
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there: 1."""
-        return ((_peak(level_from_finest).frequency, 1.0),)
+        return ((self._peaks[level_from_finest].frequency, 1.0),)
 
 
 def _doubled(plane: Tensor, dim: int) -> Tensor:
@@ -109,9 +119,7 @@ def _next(plane: Tensor) -> Tensor:
     return padded[..., 1:, 1:].contiguous()
 
 
-def _responses(
-    band: Tensor, size: tuple[int, int], first: int, level_from_finest: int, fast: bool
-) -> Tensor:
+def _responses(band: Tensor, size: tuple[int, int], first: int, peak: Peak, fast: bool) -> Tensor:
     """Return the responses (B, C, 8, h, w) to a band at every second place from ``first``."""
     reach = oriented.REACH
     more = [
@@ -120,7 +128,6 @@ def _responses(
     ]
     padded = functional.pad(band, (reach, more[1], reach, more[0]), mode="replicate")
     padded = padded[..., first:, first:]
-    peak = _peak(level_from_finest)
     fast = fast and band.numel() >= SMALLEST
     rows = size[0] if fast else max(1, LARGEST_AT_ONCE * size[0] // band.numel())
     across = step(oriented.across, band, fast)
