@@ -167,11 +167,10 @@ class Statistics:
         step = mean - old_mean
         share = before * added / total
         shift = SCALAR @ step
-        old_second, second = _scalar_second(old_comoments), _scalar_second(comoments)
+        old_second, second = scalar_second(old_comoments), scalar_second(comoments)
         old_share, share_added = before / total, added / total
-        third = (
-            shift**3 * share * (old_share - share_added)
-            + 3.0 * shift * (old_share * second - share_added * old_second)
+        third = shift**3 * share * (old_share - share_added) + 3.0 * shift * (
+            old_share * second - share_added * old_second
         )
         fourth = (
             shift**4 * share * (old_share**2 - old_share * share_added + share_added**2)
@@ -179,17 +178,15 @@ class Statistics:
             + 4.0 * shift * (old_share * higher[0] - share_added * old_higher[0])
         )
         self.higher[:, where] = old_higher + higher + np.stack((third, fourth))
-        self.comoments[:, where] = (
-            old_comoments + comoments + step[FIRST] * step[SECOND] * share
-        )
+        self.comoments[:, where] = old_comoments + comoments + step[FIRST] * step[SECOND] * share
         self.mean[:, where] = old_mean + step * share_added
 
 
-def _scalar_second(comoments: Plane) -> Plane:
+def scalar_second(comoments: Plane) -> Plane:
     """Return the second moment of the scalar from the co-moments, (P,)."""
     twice = np.where(FIRST == SECOND, 1.0, 2.0)
     weights: Plane = SCALAR[FIRST] * SCALAR[SECOND] * twice
-    return weights @ comoments
+    return np.tensordot(weights, comoments, 1)
 
 
 def _reduce(
