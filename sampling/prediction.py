@@ -1,0 +1,172 @@
+"""What the samples say of the visible difference between the current image and the converged one.
+
+Two predictions from one set of statistics. *Boundary images* (the paper's) say where the error
+is: they place samples. *Simulation* says how large its maximum is: it stops.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from sampling.boundary import QUARTILE, boundaries, detail_variances
+from sampling.error import maximum, total
+from sampling.statistics import FIRST, SECOND, Statistics
+from sampling.variance import pooled_covariance
+from torch_vdm import VDM
+from torch_vdm.cortex import Cortex
+
+# Images that are simulated for one prediction. Status: choice.
+DRAWS = 16
+
+# Distance of the predicted maximum from the mean of the simulated ones, in their standard
+# deviations. Status: fitted to the honest stop, see docs/sampling.md.
+QUANTILE = 1.9
+
+# Numbers of one simulated plane that are computed at once. Status: choice.
+AT_ONCE = 2**18
+
+
+class Model:
+    """The statistics of a round, as the metric sees them.
+
+    Parameters
+    ----------
+    metric
+        Who judges.
+    statistics
+        Of the samples so far.
+    size
+        Height and width.
+    """
+
+    def __init__(self, metric: VDM, statistics: Statistics, size: tuple[int, int]) -> None:
+        self.metric = metric
+        self.size = size
+        self.count = np.maximum(statistics.count, 1).reshape(size)
+        self.single = pooled_covariance(statistics, size)
+        self.mean = torch.from_numpy(statistics.mean.reshape(1, 3, *size))
+        self.exponent = metric.observer.summation_exponent
+        with torch.no_grad():
+            self.cortex = metric.represent(self.mean)
+        self.to_cones = _to_cones(metric)
+        self.variance = self._cone_variance(self.count)
+        self.details = detail_variances(self.variance)
+
+    @torch.no_grad()
+    def totals(self, count: NDArray[np.float64] | None = None) -> Tensor:
+        """Return the total error of the finest nodes by the boundary images, (1, 1, h, w).
+
+        In JND to the power of the summation. With ``count``, (H, W), what it would be had each
+        pixel so many samples: a smaller variance, and details without the noise that goes.
+        """
+        cortex, variances = self.cortex, self.details
+        if count is not None:
+            variances = detail_variances(self._cone_variance(count))
+            details = tuple(
+                detail
+                * (1.0 - (now - then) / (detail * detail).clamp_min(1e-300)).clamp_min(0.0).sqrt()
+                for detail, now, then in zip(cortex.details, self.details, variances, strict=True)
+            )
+            cortex = cortex._replace(details=details)
+        lower, upper = boundaries(cortex, variances, QUARTILE, self.metric.observer.signed)
+        local = self.metric.local_differences(lower, upper)
+        return total(local, maximum(local))[-1]
+
+    @torch.no_grad()
+    def simulated(self, draws: int = DRAWS) -> NDArray[np.float64]:
+        """Return the largest difference in each of ``draws`` simulated pairs of images, JND.
+
+        The details of the truth are taken as the current ones, shrunk by the share of noise among
+        their neighbours; noise with the estimated covariance makes the image from them.
+        """
+        truth = self.cortex._replace(
+            details=tuple(
+                _shrunk(detail, variance)
+                for detail, variance in zip(self.cortex.details, self.details, strict=True)
+            )
+        )
+        factor = _factor(torch.from_numpy(self.single / self.count))
+        generator = np.random.Generator(np.random.Philox(0))
+        height, width = self.size
+        step = max(1, AT_ONCE // (3 * height * width))
+        largest: list[Tensor] = []
+        for start in range(0, draws, step):
+            batch = min(step, draws - start)
+            normal = torch.from_numpy(generator.standard_normal((batch, 3, height, width)))
+            noise = torch.einsum("ijhw,bjhw->bihw", factor, normal)
+            noise = torch.einsum("ij,bjhw->bihw", self.to_cones, noise)
+            added = self.metric.transform.decompose(noise)
+            first = _batch(truth, batch)
+            second = Cortex(
+                tuple(a + b for a, b in zip(first.details, added.details, strict=True)),
+                tuple(a + b for a, b in zip(first.lowpass, added.lowpass, strict=True)),
+                first.mean + added.mean,
+            )
+            largest.append(self.metric.compare(first, second).amax((1, 2, 3)))
+        found: NDArray[np.float64] = torch.cat(largest).numpy() ** (1.0 / self.exponent)
+        return found
+
+    def predicted_maximum(self) -> float:
+        """Return the visible difference that the true one exceeds in few runs, JND."""
+        largest = self.simulated()
+        return float(largest.mean() + QUANTILE * largest.std(ddof=1))
+
+    def _cone_variance(self, count: NDArray[np.float64] | NDArray[np.int64]) -> Tensor:
+        """Return the variance of each pixel's mean in S, M, L, (1, 3, H, W)."""
+        # The diagonal of M C M^T.
+        matrix = self.to_cones.numpy()
+        weights = matrix[:, FIRST] * matrix[:, SECOND] * np.where(FIRST == SECOND, 1.0, 2.0)
+        variance = np.einsum("ck,khw->chw", weights, self.single) / count
+        return torch.from_numpy(np.maximum(variance, 0.0))[None]
+
+
+def _to_cones(metric: VDM) -> Tensor:
+    """Return the matrix from samples to S, M, L, (3, 3), float64."""
+    cones = metric.get_buffer("cones").double().cpu()
+    if metric.display.encoding == "xyz":
+        return cones
+    return cones @ metric.get_buffer("primaries").double().cpu() * metric.display.gain
+
+
+def _shrunk(detail: Tensor, variance: Tensor) -> Tensor:
+    """Return d max(0, 1 - V / mean d^2), the means over 3x3 nodes."""
+    power, noise = _around(detail * detail), _around(variance)
+    share = torch.where(power > 0.0, noise / torch.where(power > 0.0, power, 1.0), 1.0)
+    return detail * (1.0 - share).clamp_min(0.0)
+
+
+def _around(plane: Tensor) -> Tensor:
+    """Return the mean over 3x3 nodes of (B, C, 3, h, w); fewer at the border."""
+    flat = plane.flatten(1, 2)
+    mean = functional.avg_pool2d(flat, 3, 1, 1, count_include_pad=False)
+    return mean.view(plane.shape)
+
+
+def _factor(covariance: Tensor) -> Tensor:
+    """Return the Cholesky factor of (6, H, W), as (3, 3, H, W); of a singular one too."""
+    rr, rg, rb, gg, gb, bb = covariance
+    a = rr.clamp_min(0.0).sqrt()
+    over_a = torch.where(a > 0.0, 1.0 / torch.where(a > 0.0, a, 1.0), 0.0)
+    b, c = rg * over_a, rb * over_a
+    d = (gg - b * b).clamp_min(0.0).sqrt()
+    # A remainder that is only rounding would be divided by.
+    over_d = torch.where(d * d > 1e-12 * gg, 1.0 / torch.where(d > 0.0, d, 1.0), 0.0)
+    e = (gb - b * c) * over_d
+    f = (bb - c * c - e * e).clamp_min(0.0).sqrt()
+    zero = torch.zeros_like(a)
+    return torch.stack(
+        (torch.stack((a, zero, zero)), torch.stack((b, d, zero)), torch.stack((c, e, f)))
+    )
+
+
+def _batch(cortex: Cortex, batch: int) -> Cortex:
+    """Return the representation repeated ``batch`` times."""
+    return Cortex(
+        tuple(d.expand(batch, *d.shape[1:]) for d in cortex.details),
+        tuple(p.expand(batch, *p.shape[1:]) for p in cortex.lowpass),
+        cortex.mean.expand(batch, *cortex.mean.shape[1:]),
+    )

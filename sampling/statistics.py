@@ -1,0 +1,217 @@
+"""What is kept of the samples: count, mean and co-moments of every pixel, in bounded memory.
+
+The leaves of the paper's tree ("refine cortex representation", Fig. 8). Partial statistics are
+merged by the pairwise rule of Chan, Golub and LeVeque 1979, its third and fourth moments after
+Pebay 2008.
+"""
+
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sampling.renderers import Samples
+
+Plane = NDArray[np.float64]
+
+# Weights of R, G, B in the scalar whose third and fourth moments are kept. Status: choice; equal
+# ones, for events of any colour must show.
+SCALAR = np.full(3, 1.0 / 3.0)
+
+# Rows and columns of the six co-moments that are kept of the symmetric 3x3 matrix.
+FIRST, SECOND = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
+
+# A run of samples of one pixel is folded in at once, but never across a sample number that is a
+# multiple of this. So long as a run is not cut elsewhere, the batch leaves no trace in the bits.
+PIECE = 2**16
+
+
+class Statistics:
+    """Count, RGB mean and co-moments of the samples of each of ``pixels`` pixels, in float64.
+
+    Merging, in whatever order, changes nothing but the last bits. A sample that is NaN or
+    infinite in any channel is drawn and counted in ``nonfinite``, and is nowhere else.
+
+    Attributes
+    ----------
+    drawn, nonfinite
+        (P,), int64: samples drawn, and how many of them were not finite.
+    mean
+        (3, P), R, G, B.
+    comoments
+        (6, P), sums of (x_i - mean_i) (x_j - mean_j) for RR, RG, RB, GG, GB, BB.
+    higher
+        (2, P), sums of the third and fourth power of the distance from the mean of (R + G + B) / 3.
+    half_count, half_mean
+        (P,) and (3, P): count and mean of the samples of even number; None where not asked for.
+    """
+
+    def __init__(self, pixels: int, halves: bool = False) -> None:
+        self.drawn = np.zeros(pixels, np.int64)
+        self.nonfinite = np.zeros(pixels, np.int64)
+        self.mean = np.zeros((3, pixels))
+        self.comoments = np.zeros((6, pixels))
+        self.higher = np.zeros((2, pixels))
+        self.half_count = np.zeros(pixels, np.int64) if halves else None
+        self.half_mean = np.zeros((3, pixels)) if halves else None
+
+    @property
+    def count(self) -> NDArray[np.int64]:
+        """(P,), how many samples the mean is made of."""
+        return self.drawn - self.nonfinite
+
+    def add(self, samples: Samples) -> None:
+        """Fold in the next samples of some pixels; sample numbers go on where they ended.
+
+        Raises
+        ------
+        ValueError
+            Where shapes or pixel numbers are not as the protocol says.
+        """
+        pixels, radiance = samples
+        if radiance.shape != (len(pixels), 3):
+            raise ValueError(f"expected radiance of shape ({len(pixels)}, 3), got {radiance.shape}")
+        if len(pixels) == 0:
+            return
+        steps = np.diff(pixels)
+        if pixels[0] < 0 or pixels[-1] >= len(self.drawn) or (steps < 0).any():
+            raise ValueError(f"expected sorted pixel numbers from 0 to {len(self.drawn) - 1}")
+        starts = np.concatenate(([0], np.flatnonzero(steps) + 1))
+        runs, lengths = pixels[starts], np.diff(np.append(starts, len(pixels)))
+        finite = np.isfinite(radiance).all(1)
+        if self.half_count is not None:
+            number = np.arange(len(pixels)) - np.repeat(starts - self.drawn[runs], lengths)
+            self._add_halves(pixels, radiance, finite & (number % 2 == 0))
+        self.drawn[runs] += lengths
+        if not finite.all():
+            np.add.at(self.nonfinite, pixels[~finite], 1)
+            pixels, radiance = pixels[finite], radiance[finite]
+            if len(pixels) == 0:
+                return
+            starts = np.concatenate(([0], np.flatnonzero(np.diff(pixels)) + 1))
+            runs, lengths = pixels[starts], np.diff(np.append(starts, len(pixels)))
+        before = (self.count[runs] - lengths).astype(np.float64)
+        self._fold(runs, before, *_reduce(radiance, starts, lengths))
+
+    def merge(self, other: Self) -> None:
+        """Fold in the statistics of other samples of the same pixels."""
+        if len(other.drawn) != len(self.drawn):
+            raise ValueError(f"expected {len(self.drawn)} pixels, got {len(other.drawn)}")
+        before = self.count.astype(np.float64)
+        self._fold(
+            slice(None),
+            before,
+            other.count.astype(np.float64),
+            other.mean,
+            other.comoments,
+            other.higher,
+        )
+        if (
+            self.half_count is not None
+            and self.half_mean is not None
+            and other.half_count is not None
+            and other.half_mean is not None
+        ):
+            both = self.half_count + other.half_count
+            self.half_mean += (other.half_mean - self.half_mean) * (
+                other.half_count / np.maximum(both, 1)
+            )
+            self.half_count = both
+        self.drawn += other.drawn
+        self.nonfinite += other.nonfinite
+
+    def covariance(self) -> Plane:
+        """Return the covariance of single samples, (6, P), without bias; 0 below two samples."""
+        return self.comoments / np.maximum(self.count - 1, 1)
+
+    def state(self) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]:
+        """Return every array by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+    @classmethod
+    def restored(cls, state: dict[str, NDArray[np.float64] | NDArray[np.int64]]) -> Self:
+        """Return the statistics whose `state` this is."""
+        statistics = cls(len(state["drawn"]), "half_count" in state)
+        for name, value in state.items():
+            setattr(statistics, name, value.copy())
+        return statistics
+
+    def _add_halves(
+        self, pixels: NDArray[np.int64], radiance: NDArray[np.float32], kept: NDArray[np.bool_]
+    ) -> None:
+        """Fold in the samples of even number."""
+        if self.half_count is None or self.half_mean is None or not kept.any():
+            return
+        pixels, radiance = pixels[kept], radiance[kept]
+        starts = np.concatenate(([0], np.flatnonzero(np.diff(pixels)) + 1))
+        runs, lengths = pixels[starts], np.diff(np.append(starts, len(pixels)))
+        sums = np.add.reduceat(radiance.T.astype(np.float64), starts, axis=1)
+        self.half_count[runs] += lengths
+        self.half_mean[:, runs] += (sums - lengths * self.half_mean[:, runs]) / self.half_count[
+            runs
+        ]
+
+    def _fold(
+        self,
+        where: NDArray[np.int64] | slice,
+        before: Plane,
+        added: Plane,
+        mean: Plane,
+        comoments: Plane,
+        higher: Plane,
+    ) -> None:
+        """Merge moments of ``added`` samples into those of ``before``, pixel by pixel."""
+        old_mean, old_comoments = self.mean[:, where], self.comoments[:, where]
+        old_higher = self.higher[:, where]
+        total = np.maximum(before + added, 1.0)
+        step = mean - old_mean
+        share = before * added / total
+        shift = SCALAR @ step
+        old_second, second = scalar_second(old_comoments), scalar_second(comoments)
+        old_share, share_added = before / total, added / total
+        third = shift**3 * share * (old_share - share_added) + 3.0 * shift * (
+            old_share * second - share_added * old_second
+        )
+        fourth = (
+            shift**4 * share * (old_share**2 - old_share * share_added + share_added**2)
+            + 6.0 * shift**2 * (old_share**2 * second + share_added**2 * old_second)
+            + 4.0 * shift * (old_share * higher[0] - share_added * old_higher[0])
+        )
+        self.higher[:, where] = old_higher + higher + np.stack((third, fourth))
+        self.comoments[:, where] = old_comoments + comoments + step[FIRST] * step[SECOND] * share
+        self.mean[:, where] = old_mean + step * share_added
+
+
+def scalar_second(comoments: Plane) -> Plane:
+    """Return the second moment of the scalar from the co-moments, (P,)."""
+    twice = np.where(FIRST == SECOND, 1.0, 2.0)
+    weights: Plane = SCALAR[FIRST] * SCALAR[SECOND] * twice
+    return np.tensordot(weights, comoments, 1)
+
+
+def _reduce(
+    radiance: NDArray[np.float32], starts: NDArray[np.int64], lengths: NDArray[np.int64]
+) -> tuple[Plane, Plane, Plane, Plane]:
+    """Return count, mean, co-moments and higher moments of each run of samples.
+
+    About the run's first sample, so that a constant pixel has exactly no variance and a bright
+    one loses no digits; the differences of single-precision numbers are exact.
+    """
+    columns = radiance.T
+    count = lengths.astype(np.float64)
+    origin = columns[:, starts].astype(np.float64)
+    shifted = columns - np.repeat(origin, lengths, axis=1)
+    mean = np.add.reduceat(shifted, starts, axis=1) / count
+    comoments = np.empty((6, len(starts)))
+    for row, (one, other) in enumerate(zip(FIRST, SECOND, strict=True)):
+        products = np.add.reduceat(shifted[one] * shifted[other], starts)
+        comoments[row] = products - count * mean[one] * mean[other]
+    diagonal = FIRST == SECOND
+    comoments[diagonal] = np.maximum(comoments[diagonal], 0.0)
+    scalar = SCALAR @ shifted
+    centre = SCALAR @ mean
+    scalar -= np.repeat(centre, lengths)
+    square = scalar * scalar
+    third = np.add.reduceat(square * scalar, starts)
+    fourth = np.add.reduceat(square * square, starts)
+    return count, mean + origin, comoments, np.stack((third, fourth))
