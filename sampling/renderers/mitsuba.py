@@ -66,7 +66,8 @@ class MitsubaRenderer:
     fingerprint
         A hash of the scene's file, of every file that it names, and of the parameters.
     aov_sums
-        (6, H W), float64: sums of albedo R, G, B and normal X, Y, Z; None without ``aov``.
+        (7, H W), float64: sums of albedo R, G, B and normal X, Y, Z, and how many samples they
+        are of; None without ``aov``. A continued run begins with those of the run before.
 
     Raises
     ------
@@ -122,7 +123,7 @@ class MitsubaRenderer:
                 {"type": "aov", "aovs": AOVS, "image": self._integrator}
             )
             self._aov_at = len(self._integrator.aov_names()) - len(AOV_NAMES)
-            self.aov_sums = np.zeros((len(AOV_NAMES), width * height))
+            self.aov_sums = np.zeros((len(AOV_NAMES) + 1, width * height))
 
     def sample(
         self, pixels: NDArray[np.int64], first: NDArray[np.int64], count: NDArray[np.int64]
@@ -144,7 +145,7 @@ class MitsubaRenderer:
             except RuntimeError as error:
                 raise SceneError(f"{self.path}: {_one_line(error)}") from error
             if self.aov_sums is not None:
-                for sums, plane in zip(self.aov_sums, aovs, strict=True):
+                for sums, plane in zip(self.aov_sums, [*aovs, None], strict=True):
                     sums += np.bincount(which[part], plane, len(sums))
         return Samples(which, radiance)
 
@@ -267,6 +268,16 @@ class MitsubaRenderer:
                 f"volpath or direct, got {integrator.class_name()}"
             )
         return integrator
+
+    def aovs(self) -> dict[str, NDArray[np.float64]]:
+        """Return the mean albedo and shading normal so far, (H, W) each, by name of channel."""
+        if self.aov_sums is None:
+            return {}
+        *sums, count = self.aov_sums
+        return {
+            name: (plane / np.maximum(count, 1.0)).reshape(self.size)
+            for name, plane in zip(AOV_NAMES, sums, strict=True)
+        }
 
     def plan(self) -> dict[str, Any]:
         """Return what is simulated and why, for the JSON."""
