@@ -1,5 +1,7 @@
-"""The Haar tree of variances, and the two boundary images ("refine error estimate" and "construct
-boundary images" of Fig. 8)."""
+"""The Haar tree of variances, and the two boundary images.
+
+"Refine error estimate" and "construct boundary images" of Fig. 8.
+"""
 
 import torch
 from torch import Tensor

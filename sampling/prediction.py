@@ -4,8 +4,6 @@ Two predictions from one set of statistics. *Boundary images* (the paper's) say 
 is: they place samples. *Simulation* says how large its maximum is: it stops.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
