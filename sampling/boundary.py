@@ -12,6 +12,9 @@ from torch_vdm.quadtree import pad_even
 # Distance of the quartiles of a normal distribution from its mean, in standard deviations.
 QUARTILE = 0.6744897501960817
 
+# A variance of nothing, in cone responses squared. Status: choice.
+NONE = 1e-200
+
 
 def detail_variances(leaves: Tensor) -> tuple[Tensor, ...]:
     """Return the variances of the detail coefficients of independent leaves (Section 3).
@@ -74,7 +77,8 @@ def boundaries(
     lower: list[Tensor] = []
     upper: list[Tensor] = []
     for detail, variance in zip(cortex.details, variances, strict=True):
-        margin = spread * variance.sqrt()
+        # Not 0, for the slope of its root there is infinite.
+        margin = spread * variance.clamp_min(NONE).sqrt()
         if signed:
             lower.append(detail - margin)
             upper.append(detail + margin)
