@@ -142,9 +142,14 @@ def _to_cones(metric: VDM) -> Tensor:
 
 
 def _shrunk(detail: Tensor, variance: Tensor) -> Tensor:
-    """Return d max(0, 1 - V / mean d^2), the means over 3x3 nodes."""
-    power, noise = _around(detail * detail), _around(variance)
-    share = torch.where(power > 0.0, noise / torch.where(power > 0.0, power, 1.0), 1.0)
+    """Return d max(0, 1 - V / d^2), with d^2 its mean over 3x3 nodes where that is smaller.
+
+    The mean alone would leave the noise beside an edge as it is, and itself alone what noise has
+    raised by chance.
+    """
+    power = detail * detail
+    power = torch.minimum(power, _around(power))
+    share = torch.where(power > 0.0, variance / torch.where(power > 0.0, power, 1.0), 1.0)
     return detail * (1.0 - share).clamp_min(0.0)
 
 
