@@ -1,5 +1,7 @@
-"""The Haar tree of variances, and the two boundary images ("refine error estimate" and "construct
-boundary images" of Fig. 8)."""
+"""The Haar tree of variances, and the two boundary images.
+
+"Refine error estimate" and "construct boundary images" of Fig. 8.
+"""
 
 import torch
 from torch import Tensor
@@ -9,6 +11,9 @@ from torch_vdm.quadtree import pad_even
 
 # Distance of the quartiles of a normal distribution from its mean, in standard deviations.
 QUARTILE = 0.6744897501960817
+
+# A variance of nothing, in cone responses squared. Status: choice.
+NONE = 1e-200
 
 
 def detail_variances(leaves: Tensor) -> tuple[Tensor, ...]:
@@ -72,7 +77,8 @@ def boundaries(
     lower: list[Tensor] = []
     upper: list[Tensor] = []
     for detail, variance in zip(cortex.details, variances, strict=True):
-        margin = spread * variance.sqrt()
+        # Not 0, for the slope of its root there is infinite.
+        margin = spread * variance.clamp_min(NONE).sqrt()
         if signed:
             lower.append(detail - margin)
             upper.append(detail + margin)

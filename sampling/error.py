@@ -1,6 +1,8 @@
-"""The trees of local, maximum and total error ("local visual difference prediction" and "update
-maximum error tree" of Fig. 8). All in JND to the power of the summation, 2.4, or in the unit of
-any other error that adds up along a path."""
+"""The trees of local, maximum and total error.
+
+"Local visual difference prediction" and "update maximum error tree" of Fig. 8. The local errors
+come from `VDM.local_differences`, in JND to the power of the summation, 2.4.
+"""
 
 from collections.abc import Sequence
 

@@ -4,8 +4,6 @@ Two predictions from one set of statistics. *Boundary images* (the paper's) say 
 is: they place samples. *Simulation* says how large its maximum is: it stops.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -25,6 +23,9 @@ DRAWS = 16
 # Distance of the predicted maximum from the mean of the simulated ones, in their standard
 # deviations. Status: fitted to the honest stop, see docs/sampling.md.
 QUANTILE = 1.9
+
+# Power that stands for a maximum where a derivative is needed. Status: choice, measured.
+SHARPNESS = 8.0
 
 # Numbers of one simulated plane that are computed at once. Status: choice.
 AT_ONCE = 2**18
@@ -55,24 +56,38 @@ class Model:
         self.to_cones = _to_cones(metric)
         self.variance = self._cone_variance(self.count)
         self.details = detail_variances(self.variance)
+        self.truth = self.cortex._replace(
+            details=tuple(
+                _shrunk(detail, variance)
+                for detail, variance in zip(self.cortex.details, self.details, strict=True)
+            )
+        )
 
-    @torch.no_grad()
     def totals(self, count: NDArray[np.float64] | None = None) -> Tensor:
         """Return the total error of the finest nodes by the boundary images, (1, 1, h, w).
 
         In JND to the power of the summation. With ``count``, (H, W), what it would be had each
-        pixel so many samples: a smaller variance, and details without the noise that goes.
+        pixel so many samples.
         """
-        cortex, variances = self.cortex, self.details
-        if count is not None:
-            variances = detail_variances(self._cone_variance(count))
-            details = tuple(
-                detail
-                * (1.0 - (now - then) / (detail * detail).clamp_min(1e-300)).clamp_min(0.0).sqrt()
-                for detail, now, then in zip(cortex.details, self.details, variances, strict=True)
-            )
-            cortex = cortex._replace(details=details)
-        lower, upper = boundaries(cortex, variances, QUARTILE, self.metric.observer.signed)
+        with torch.no_grad():
+            return self._totals(self.variance if count is None else self._cone_variance(count))
+
+    def shares(self) -> NDArray[np.float64]:
+        """Return how much each pixel's noise adds to the largest totals, (H, W), not negative.
+
+        Minus the derivative of a sum of the totals to the power of `SHARPNESS` by the logarithm
+        of each pixel's samples, in units of the whole.
+        """
+        logarithm = torch.zeros(self.size, dtype=torch.float64, requires_grad=True)
+        totals = self._totals(self.variance * torch.exp(-logarithm))
+        largest = totals.detach().amax().clamp_min(1e-300)
+        (gradient,) = torch.autograd.grad(((totals / largest) ** SHARPNESS).sum(), logarithm)
+        shares: NDArray[np.float64] = gradient.neg().clamp_min(0.0).numpy()
+        return shares / max(float(shares.sum()), 1e-300)
+
+    def _totals(self, variance: Tensor) -> Tensor:
+        variances = detail_variances(variance)
+        lower, upper = boundaries(self.truth, variances, QUARTILE, self.metric.observer.signed)
         local = self.metric.local_differences(lower, upper)
         return total(local, maximum(local))[-1]
 
@@ -83,12 +98,6 @@ class Model:
         The details of the truth are taken as the current ones, shrunk by the share of noise among
         their neighbours; noise with the estimated covariance makes the image from them.
         """
-        truth = self.cortex._replace(
-            details=tuple(
-                _shrunk(detail, variance)
-                for detail, variance in zip(self.cortex.details, self.details, strict=True)
-            )
-        )
         factor = _factor(torch.from_numpy(self.single / self.count))
         generator = np.random.Generator(np.random.Philox(0))
         height, width = self.size
@@ -100,7 +109,7 @@ class Model:
             noise = torch.einsum("ijhw,bjhw->bihw", factor, normal)
             noise = torch.einsum("ij,bjhw->bihw", self.to_cones, noise)
             added = self.metric.transform.decompose(noise)
-            first = _batch(truth, batch)
+            first = _batch(self.truth, batch)
             second = Cortex(
                 tuple(a + b for a, b in zip(first.details, added.details, strict=True)),
                 tuple(a + b for a, b in zip(first.lowpass, added.lowpass, strict=True)),
@@ -133,9 +142,14 @@ def _to_cones(metric: VDM) -> Tensor:
 
 
 def _shrunk(detail: Tensor, variance: Tensor) -> Tensor:
-    """Return d max(0, 1 - V / mean d^2), the means over 3x3 nodes."""
-    power, noise = _around(detail * detail), _around(variance)
-    share = torch.where(power > 0.0, noise / torch.where(power > 0.0, power, 1.0), 1.0)
+    """Return d max(0, 1 - V / d^2), with d^2 its mean over 3x3 nodes where that is smaller.
+
+    The mean alone would leave the noise beside an edge as it is, and itself alone what noise has
+    raised by chance.
+    """
+    power = detail * detail
+    power = torch.minimum(power, _around(power))
+    share = torch.where(power > 0.0, variance / torch.where(power > 0.0, power, 1.0), 1.0)
     return detail * (1.0 - share).clamp_min(0.0)
 
 

@@ -83,7 +83,8 @@ class Settings:
                 raise ValueError(f"expected a noise threshold over 0, got {self.noise_threshold}")
 
 
-class Request(NamedTuple):
+@dataclass(frozen=True)
+class Request:
     """Samples to draw: numbers ``first[i]`` to ``first[i] + count[i] - 1`` of ``pixels[i]``."""
 
     pixels: NDArray[np.int64]
@@ -343,7 +344,7 @@ def rounds(sampler: Sampler, renderer: Renderer, at_once: int = 2**20) -> Iterat
         if request is None:
             return
         for part in request.parts(at_once):
-            sampler.tell(renderer.sample(*part))
+            sampler.tell(renderer.sample(part.pixels, part.first, part.count))
 
 
 def _under(prefix: str, state: dict[str, Any]) -> dict[str, Any]:

@@ -50,26 +50,27 @@ class Strategy(Protocol):
 
 
 class Perceptual:
-    """The paper's: the pixels of the finest nodes whose total is over the tolerance."""
+    """The paper's: more samples below the nodes whose total is over the tolerance.
+
+    A total over the tolerance is the sum of errors down a path, of neighbours too by pooling, so
+    that it is traced back to the pixels whose noise it is made of. Where every pixel's samples are
+    in proportion to its share, no other distribution of as many does better; a round goes there
+    half way in the logarithm, for the shares of what it improves will fall.
+    """
 
     halves = False
 
     def wanted(self, model: Model, statistics: Statistics, goal: float) -> Plane:
-        """Give each selected node the least growth with which the model predicts the goal.
-
-        All nodes are solved for at once, for what one gets lessens the coarse error of others.
-        """
+        """Find the fewest samples in proportion to the shares at which the model predicts the goal."""
         del statistics
-        over = model.totals() > goal
-        low = torch.zeros(over.shape, dtype=torch.float64)
-        high = torch.where(over, np.log(LARGEST_GROWTH), 0.0).double()
+        worth = np.sqrt(model.shares() / model.count)
+        worth /= max(float(worth.max()), 1e-300)
+        low, high = 0.0, float(np.log(LARGEST_GROWTH))
         for _ in range(STEPS):
             middle = 0.5 * (low + high)
-            enough = model.totals(_grown(model, middle)) <= goal
-            high = torch.where(enough, middle, high)
-            low = torch.where(enough, low, middle)
-        growth = torch.where(over, high.clamp_min(np.log(SMALLEST_GROWTH)), 0.0)
-        return _grown(model, growth)
+            enough = float(model.totals(_grown(model, worth, middle)).max()) <= goal
+            low, high = (low, middle) if enough else (middle, high)
+        return _grown(model, worth, max(high, float(np.log(SMALLEST_GROWTH))))
 
 
 class _Levelled:
@@ -155,8 +156,7 @@ STRATEGIES: dict[str, Strategy] = {
 }
 
 
-def _grown(model: Model, growth: torch.Tensor) -> Plane:
-    """Return the samples of every pixel, (H, W), after each node's growth, (1, 1, h, w), in log."""
-    factor = push(growth, model.size)[0, 0].exp().numpy()
-    count: Plane = model.count * factor
+def _grown(model: Model, worth: Plane, growth: float) -> Plane:
+    """Return the samples of every pixel, (H, W), where the worthiest grow by exp(growth)."""
+    count: Plane = model.count * np.maximum(worth * np.exp(growth), 1.0)
     return count

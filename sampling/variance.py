@@ -8,7 +8,7 @@ each is mixed with its parent's (empirical Bayes), by how much each of them know
 import numpy as np
 from numpy.typing import NDArray
 
-from sampling.statistics import Statistics, scalar_second
+from sampling.statistics import FIRST, SECOND, Statistics, scalar_second
 
 Plane = NDArray[np.float64]
 
@@ -31,30 +31,43 @@ def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
         (
             statistics.comoments,
             statistics.higher[1:],
+            statistics.mean * counts,
             np.maximum(counts - 1.0, 0.0)[None],
             counts[None],
         )
-    ).reshape(9, *size)
+    ).reshape(12, *size)
     levels = [sums]
     while max(levels[-1].shape[1:]) > 1:
         levels.append(_four(levels[-1]))
-    estimate = _own(levels.pop())
+    estimate, mean = _own(levels.pop())
     while levels:
         nodes = levels.pop()
-        parent = _push(estimate, nodes.shape[1:])
+        own, own_mean = _own(nodes)
+        parent, parent_mean = _push(estimate, nodes.shape[1:]), _push(mean, nodes.shape[1:])
         second, fourth = scalar_second(parent[:6]), parent[6]
-        kurtosis = np.where(second > 0.0, fourth / np.where(second > 0.0, second, 1.0) ** 2, NORMAL)
-        freedom = 2.0 * nodes[7] / np.maximum(kurtosis - 1.0, 1e-3)
+        kurtosis = _ratio(fourth, second * second, NORMAL)
+        freedom = 2.0 * nodes[11] / np.maximum(kurtosis - 1.0, 1e-3)
         weight = PRIOR / (PRIOR + freedom)
-        estimate = weight * parent + (1.0 - weight) * _own(nodes)
+        mean = weight * parent_mean + (1.0 - weight) * own_mean
+        scale = _ratio(np.abs(mean), np.abs(parent_mean), 1.0)
+        scalar = scale.mean(0)
+        prior = parent * np.concatenate((scale[FIRST] * scale[SECOND], scalar[None] ** 4))
+        estimate = weight * prior + (1.0 - weight) * own
     return estimate[:6]
 
 
-def _own(sums: Plane) -> Plane:
-    """Return covariance and fourth moment of the samples of each node about their pixels' means."""
-    return np.concatenate(
-        (sums[:6] / np.maximum(sums[7], 1.0), sums[6:7] / np.maximum(sums[8], 1.0))
-    )
+def _own(sums: Plane) -> tuple[Plane, Plane]:
+    """Return covariance and fourth moment of the samples of each node, and its mean.
+
+    About the means of the pixels, not of the node: a texture is no noise.
+    """
+    count = np.maximum(sums[11], 1.0)
+    return np.concatenate((sums[:6] / np.maximum(sums[10], 1.0), sums[6:7] / count)), sums[7:10] / count
+
+
+def _ratio(over: Plane, under: Plane, otherwise: float) -> Plane:
+    """Return a quotient, ``otherwise`` where its divisor is 0."""
+    return np.where(under > 0.0, over / np.where(under > 0.0, under, 1.0), otherwise)
 
 
 def _four(plane: Plane) -> Plane:
