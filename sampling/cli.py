@@ -225,7 +225,7 @@ class _Job:
                 return "interrupted"
             for part in request.parts(at_once):
                 start = time.perf_counter()
-                samples = self.renderer.sample(*part)
+                samples = self.renderer.sample(part.pixels, part.first, part.count)
                 middle = time.perf_counter()
                 sampler.tell(samples)
                 end = time.perf_counter()
