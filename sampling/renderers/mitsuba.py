@@ -259,6 +259,10 @@ class MitsubaRenderer:
         """Return the scene's integrator, if light can be asked of it ray by ray."""
         mi = self._mi
         integrator = self._scene.integrator()
+        if integrator is None:
+            raise SceneError(
+                f'{self.path}: expected an integrator, got none; add <integrator type="path"/>'
+            )
         differentiable = mi.python.ad.integrators.common.ADIntegrator
         if not isinstance(integrator, mi.SamplingIntegrator) or isinstance(
             integrator, differentiable
@@ -387,11 +391,10 @@ def _integrator_names(mi: Any, state: Any) -> tuple[str, int | None]:
 
     Of nested ones (aov, moment) the innermost.
     """
-    found = [node for node in _nodes(mi, state, "Integrator") if not list(node.references())]
-    if not found:
-        return "path", None  # Mitsuba's own choice where a scene has none
-    depth = int(found[-1].get("max_depth", -1))
-    return found[-1].plugin_name(), depth if depth >= 0 else None
+    found = _nodes(mi, state, "Integrator")
+    inner = [node for node in found if not list(node.references())] or found
+    depth = int(inner[-1].get("max_depth", -1))
+    return inner[-1].plugin_name(), depth if depth >= 0 else None
 
 
 def _plan(
