@@ -1,9 +1,8 @@
 """A run on disk: written whole or not at all, continued bit for bit, or refused in words."""
 
+import contextlib
 import json
 import os
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,12 +11,13 @@ import numpy as np
 
 from torch_vdm.io.refusal import printable
 
-# What a file says it is; the number is raised when its layout changes.
+# What a file says it is, and the number that is raised when its layout changes.
 FORMAT = "vdm-render checkpoint"
 FORMAT_VERSION = 1
 
-# The entry of the archive that holds everything but arrays, as JSON.
-_HEADER = "header"
+# The entry of the archive that holds everything but arrays, as JSON, and what comes before the
+# name of an array.
+_HEADER, _ARRAY = "header", "array."
 
 # What a run is, and how it is called where two differ.
 WORDS = {
@@ -68,22 +68,24 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     """
     arrays = {name: v for name, v in checkpoint.state.items() if isinstance(v, np.ndarray)}
     header = {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
+        FORMAT: FORMAT_VERSION,
         "identity": checkpoint.identity,
+        "arrays": sorted(arrays),
         "values": {name: v for name, v in checkpoint.state.items() if name not in arrays},
     }
     # Always the same name: whoever is killed while he writes leaves one file, not many.
     temporary = path.with_name(f".{path.name}.partial")
     try:
         with temporary.open("wb") as file:
-            entries: dict[str, Any] = {_HEADER: np.array(json.dumps(header)), **arrays}
+            entries: dict[str, Any] = {_ARRAY + name: array for name, array in arrays.items()}
+            entries[_HEADER] = np.array(json.dumps(header))
             np.savez(file, **entries)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
         raise CheckpointError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
@@ -97,24 +99,24 @@ def load(path: Path, identity: Mapping[str, Any]) -> dict[str, Any]:
         or settings.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             header: dict[str, Any] = json.loads(str(archive[_HEADER]))
-            state = {name: archive[name] for name in archive.files if name != _HEADER}
+            version = header[FORMAT]
+            if version == FORMAT_VERSION:
+                arrays = {name: archive[_ARRAY + name] for name in header["arrays"]}
     except FileNotFoundError as error:
         raise CheckpointError(f"{path}: no such file; check the name") from error
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+    except Exception as error:  # NumPy and zipfile raise whatever a damaged byte leads to
         raise CheckpointError(
             f"{path}: expected a checkpoint of vdm-render, got a damaged or another file; "
             "start anew without --resume"
         ) from error
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise CheckpointError(f"{path}: expected a checkpoint of vdm-render, got another archive")
-    if header.get("format_version") != FORMAT_VERSION:
+    if version != FORMAT_VERSION:
         raise CheckpointError(
             f"{path}: expected a checkpoint of format {FORMAT_VERSION}, got "
-            f"{header.get('format_version')}; continue it with the version that wrote it"
+            f"{version}; continue it with the version that wrote it"
         )
     begun = header["identity"]
     for name, words in WORDS.items():
@@ -129,4 +131,4 @@ def load(path: Path, identity: Mapping[str, Any]) -> dict[str, Any]:
             "since; start anew without --resume"
         )
     values: dict[str, Any] = header["values"]
-    return state | values
+    return arrays | values

@@ -235,7 +235,10 @@ class _Job:
                 drawn, drawing = drawn + part.samples, drawing + middle - start
                 line.part(progress.samples, drawn / drawing, interrupt.count > 0)
                 if options.checkpoint and time.monotonic() - saved > CHECKPOINT_SECONDS:
-                    self.save(options.checkpoint)
+                    try:
+                        self.save(options.checkpoint)
+                    except checkpoint.CheckpointError as error:  # a full disk: no reason to stop
+                        print(f"vdm-render: warning: {error}", file=sys.stderr)
                     saved = time.monotonic()
                 if interrupt.count > 1:
                     return "interrupted"
