@@ -267,6 +267,7 @@ class _Job:
         """Return what the JSON says."""
         options, report, progress = self.options, self.sampler.report(), self.progress
         height, width = self.renderer.size
+        empty = int((self.sampler.count == 0).sum())
         return {
             "strategy": options.strategy,
             "seed": options.seed,
@@ -276,7 +277,8 @@ class _Job:
             "spp_mean": progress.samples / (height * width),
             "predicted_max_jnd": report.predicted if report is not None else None,
             "visible_fraction": report.over if report is not None else None,
-            "converged": report is not None and report.converged,
+            # A pixel without a finite sample is black, and nothing is known of it.
+            "converged": report is not None and report.converged and not empty,
             "stop_reason": reason,
             "seconds_render": progress.seconds_render,
             "seconds_metric": progress.seconds_metric,
@@ -286,6 +288,7 @@ class _Job:
             "samples_min": int(self.sampler.count.min()),
             "samples_max": int(self.sampler.count.max()),
             "nonfinite": report.nonfinite if report is not None else 0,
+            "pixels_empty": empty,
             "unbiased": options.unbiased,
             "width": width,
             "height": height,
@@ -476,6 +479,11 @@ def _text(figures: dict[str, Any], options: argparse.Namespace) -> str:
         lines.append(
             f"left out: {figures['nonfinite']} samples that were NaN or infinite; "
             "check the scene's materials"
+        )
+    if figures["pixels_empty"]:
+        lines.append(
+            f"black: {figures['pixels_empty']} pixels that have no finite sample; "
+            "nothing can be said of them"
         )
     plan = figures["plan"]
     depth = "no limit of depth" if plan["max_depth"] is None else f"depth {plan['max_depth']}"
