@@ -55,12 +55,17 @@ def detail_variances(leaves: Tensor) -> tuple[Tensor, ...]:
 
 
 def boundaries(
-    cortex: Cortex, variances: tuple[Tensor, ...], spread: float, signed: bool
+    cortex: Cortex,
+    variances: tuple[Tensor, ...],
+    mean_variance: Tensor,
+    spread: float,
+    signed: bool,
 ) -> tuple[Cortex, Cortex]:
     """Return the lower and the upper boundary image of a representation.
 
     Details ``spread`` standard deviations below and above: the paper's 25 % and 75 % points with
-    `QUARTILE`. Their lowpass is that of ``cortex``.
+    `QUARTILE`. Their lowpass is that of ``cortex``; the mean, which the calibrated observer
+    compares, spreads as the details do.
 
     Parameters
     ----------
@@ -68,6 +73,8 @@ def boundaries(
         The current means, in cone space.
     variances
         Of its details, as `detail_variances` gives them.
+    mean_variance
+        (B, C, 1, 1), of the mean of the image.
     spread
         In standard deviations.
     signed
@@ -88,4 +95,8 @@ def boundaries(
             size = detail.abs()
             lower.append(sign * (size - margin).clamp_min(0.0))
             upper.append(sign * (size + margin))
-    return cortex._replace(details=tuple(lower)), cortex._replace(details=tuple(upper))
+    margin = spread * mean_variance.clamp_min(NONE).sqrt()
+    return (
+        cortex._replace(details=tuple(lower), mean=cortex.mean - margin),
+        cortex._replace(details=tuple(upper), mean=cortex.mean + margin),
+    )

@@ -4,6 +4,8 @@ Two predictions from one set of statistics. *Boundary images* (the paper's) say 
 is: they place samples. *Simulation* says how large its maximum is: it stops.
 """
 
+import math
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -20,12 +22,13 @@ from torch_vdm.cortex import Cortex
 # Images that are simulated for one prediction. Status: choice.
 DRAWS = 16
 
-# Distance of the predicted maximum from the mean of the simulated ones, in their standard
-# deviations. Status: fitted to the honest stop, see docs/sampling.md.
-QUANTILE = 1.9
+# The predicted maximum lies this many standard deviations over the mean of the simulated ones;
+# their own variance, and that of the prediction's error, as a share of the mean, are added.
+# Status: fitted to the honest stop, see docs/sampling.md.
+QUANTILE, INEXACT = 2.2, 0.05
 
 # Power that stands for a maximum where a derivative is needed. Status: choice, measured.
-SHARPNESS = 8.0
+SHARPNESS = 4.0
 
 # Numbers of one simulated plane that are computed at once. Status: choice.
 AT_ONCE = 2**18
@@ -48,7 +51,9 @@ class Model:
         self.metric = metric
         self.size = size
         self.count = np.maximum(statistics.count, 1).reshape(size)
-        self.single = pooled_covariance(statistics, size)
+        # Nothing is known of a pixel without a finite sample, and no sample will help.
+        seen = (statistics.count > 0).reshape(size)
+        self.single = pooled_covariance(statistics, size) * seen
         self.mean = torch.from_numpy(statistics.mean.reshape(1, 3, *size))
         self.exponent = metric.observer.summation_exponent
         with torch.no_grad():
@@ -86,9 +91,16 @@ class Model:
         return shares / max(float(shares.sum()), 1e-300)
 
     def _totals(self, variance: Tensor) -> Tensor:
-        variances = detail_variances(variance)
-        lower, upper = boundaries(self.truth, variances, QUARTILE, self.metric.observer.signed)
-        local = self.metric.local_differences(lower, upper)
+        lower, upper = boundaries(
+            self.truth,
+            detail_variances(variance),
+            variance.mean((-2, -1), keepdim=True) / variance[0, 0].numel(),
+            QUARTILE,
+            self.metric.observer.signed,
+        )
+        root = self.metric.lowpass_difference(lower, upper) ** self.exponent
+        first, *others = self.metric.local_differences(lower, upper) or (0.0,)
+        local = (first + root.sum(1, keepdim=True), *others)
         return total(local, maximum(local))[-1]
 
     @torch.no_grad()
@@ -122,7 +134,8 @@ class Model:
     def predicted_maximum(self) -> float:
         """Return the visible difference that the true one exceeds in few runs, JND."""
         largest = self.simulated()
-        return float(largest.mean() + QUANTILE * largest.std(ddof=1))
+        mean = float(largest.mean())
+        return mean + QUANTILE * math.hypot(float(largest.std(ddof=1)), INEXACT * mean)
 
     def _cone_variance(self, count: NDArray[np.float64] | NDArray[np.int64]) -> Tensor:
         """Return the variance of each pixel's mean in S, M, L, (1, 3, H, W)."""

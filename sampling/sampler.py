@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sampling.prediction import Model
 from sampling.renderers import Renderer, Samples
 from sampling.statistics import FIRST, PIECE, SECOND, Statistics
-from sampling.strategies import LARGEST_GROWTH, STRATEGIES, HalfBuffer
+from sampling.strategies import LARGEST_GROWTH, SMALLEST_GROWTH, STRATEGIES, HalfBuffer
 from sampling.variance import pooled_covariance
 from torch_vdm import VDM
 from torch_vdm.quadtree import push
@@ -29,6 +29,10 @@ STATE_VERSION = 1
 
 # Share of the tolerance that a round aims at, for a prediction is not exact. Status: choice.
 AIM = 0.98
+
+# Share of the tolerance at which an unbiased run ends its decisions. Status: fitted to the honest
+# stop, see docs/sampling.md.
+UNBIASED = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,8 +78,10 @@ class Settings:
             raise ValueError(f"expected a tolerance over 0 JND, got {self.tolerance}")
         if self.pilot < 2:
             raise ValueError(f"expected at least 2 pilot samples, got {self.pilot}")
-        if self.max_spp is not None and self.max_spp < 1:
-            raise ValueError(f"expected at least 1 sample per pixel, got {self.max_spp}")
+        if self.max_spp is not None and self.max_spp < (2 if self.unbiased else 1):
+            raise ValueError(
+                f"expected at least 1 sample per pixel, 2 for an unbiased run, got {self.max_spp}"
+            )
         if self.noise_threshold is not None:
             if self.strategy != "halfbuffer":
                 raise ValueError("expected the halfbuffer strategy with a noise threshold")
@@ -185,11 +191,11 @@ class Sampler:
         self.settings = settings or Settings()
         self._strategy = STRATEGIES[self.settings.strategy]
         self._statistics = self._empty()
-        pilot = min(self.settings.pilot, self.settings.max_spp or self.settings.pilot)
-        self._target = np.full(self.size[0] * self.size[1], pilot, np.int64)
+        self._target = np.full(self.size[0] * self.size[1], self._pilot(), np.int64)
         self._rounds = 0
-        self._drawn_before = 0
-        self._showing = False
+        # Of an unbiased run, once it has decided: what it drew for that, and why it stopped.
+        self._before = np.zeros_like(self._target)
+        self._decided: StopReason | None = None
         self._report: Report | None = None
 
     def ask(self) -> Request | None:
@@ -203,7 +209,7 @@ class Sampler:
             if not left.any():
                 return None
         pixels = np.flatnonzero(left)
-        return Request(pixels, self._statistics.drawn[pixels], left[pixels])
+        return Request(pixels, (self._before + self._statistics.drawn)[pixels], left[pixels])
 
     def tell(self, samples: Samples) -> None:
         """Fold in samples: the parts of what was asked, in order."""
@@ -241,8 +247,8 @@ class Sampler:
             "height": self.size[0],
             "width": self.size[1],
             "rounds": self._rounds,
-            "drawn_before": self._drawn_before,
-            "showing": self._showing,
+            "decided": self._decided,
+            "before": self._before.copy(),
             "target": self._target.copy(),
             **{f"settings.{name}": value for name, value in asdict(self.settings).items()},
             **{f"statistics.{name}": a.copy() for name, a in self._statistics.state().items()},
@@ -265,8 +271,8 @@ class Sampler:
         size = (int(state["height"]), int(state["width"]))
         sampler = cls(size, metric, Settings(**_under("settings.", state)))
         sampler._rounds = int(state["rounds"])
-        sampler._drawn_before = int(state["drawn_before"])
-        sampler._showing = bool(state["showing"])
+        sampler._decided = state["decided"]
+        sampler._before = np.array(state["before"], np.int64)
         sampler._target = np.array(state["target"], np.int64)
         sampler._statistics = Statistics.restored(_under("statistics.", state))
         report = _under("report.", state)
@@ -279,53 +285,87 @@ class Sampler:
     def _left(self) -> NDArray[np.int64]:
         return self._target - self._statistics.drawn
 
+    def _pilot(self) -> int:
+        return min(self.settings.pilot, self._most() or self.settings.pilot)
+
+    def _most(self) -> int | None:
+        """Return the most samples of a pixel before the run must stop; None: any number."""
+        most = self.settings.max_spp
+        return most // 2 if most is not None and self.settings.unbiased else most
+
     def _decide(self) -> None:
-        """End a round: predict, and stop or set how many samples every pixel is to have."""
-        statistics, tolerance = self._statistics, self.settings.tolerance
-        self._rounds += 1
+        """End a round: predict, then stop, or say how many samples every pixel is to have."""
+        statistics = self._statistics
         model = Model(self.metric, statistics, self.size)
         predicted = model.predicted_maximum()
-        exponent = model.exponent
         totals = model.totals()
-        largest = float(totals.max()) ** (1.0 / exponent)
+        largest = float(totals.max()) ** (1.0 / model.exponent)
         # The boundary images say where, the simulation how much.
         scale = predicted / largest if largest > 0.0 else 1.0
-        jnd = push(totals, self.size)[0, 0].numpy() ** (1.0 / exponent) * scale
-        reason: StopReason | None = None
-        wanted = np.asarray(model.count, np.float64)
-        threshold = self.settings.noise_threshold
-        if threshold is not None and isinstance(self._strategy, HalfBuffer):
-            noise = self._strategy.noise(statistics, self.size)
-            if noise.max() <= threshold:
-                reason = "noise_threshold"
+        jnd = push(totals, self.size)[0, 0].numpy() ** (1.0 / model.exponent) * scale
+        drawn = int((self._before + statistics.drawn).sum())
+        forecast, reason = 0, self._decided
+        if reason is None:
+            reason = self._enough(predicted)
+        if reason is None:
+            wanted = self._wanted(model, scale)
+            target = np.ceil(wanted).astype(np.int64).reshape(-1) + statistics.nonfinite
+            target = np.maximum(target, statistics.drawn)
+            forecast = int((target - statistics.drawn).sum())
+            most = self._most()
+            if most is not None:
+                target = np.maximum(np.minimum(target, most), statistics.drawn)
+            if (target > statistics.drawn).any():
+                self._target = target
             else:
-                growth = np.clip((noise / threshold) ** 2, 1.0, LARGEST_GROWTH)
-                wanted = model.count * np.where(noise > threshold, np.maximum(growth, 1.05), 1.0)
-        elif predicted <= tolerance:
-            reason = "tolerance"
-        else:
-            goal = (AIM * tolerance / scale) ** exponent
-            wanted = self._strategy.wanted(model, statistics, goal)
-        target = np.maximum(np.ceil(wanted).astype(np.int64).reshape(-1), 0) + statistics.nonfinite
-        target = np.maximum(target, statistics.drawn)
-        forecast = int((target - statistics.drawn).sum())
-        if self.settings.max_spp is not None:
-            target = np.maximum(np.minimum(target, self.settings.max_spp), statistics.drawn)
-        if reason is None and not (target > statistics.drawn).any():
-            reason = "max_spp"
-        self._target = statistics.drawn.copy() if reason is not None else target
-        drawn = int(statistics.drawn.sum()) + self._drawn_before
+                reason, forecast = "max_spp", 0
+        if self.settings.unbiased:
+            shown = self._decided is not None
+            if reason is not None and not shown:
+                # The same numbers of samples once more, on which nothing has been decided.
+                self._decided, reason = reason, None
+                self._before = statistics.drawn
+                self._target = statistics.drawn.copy()
+                self._statistics = self._empty()
+            if not shown:
+                forecast = 2 * forecast + int(self._target.sum())
+        self._rounds += 1
         self._report = Report(
             round=self._rounds,
             samples=drawn,
             spp=drawn / len(self._target),
             predicted=predicted,
-            over=float((jnd > tolerance).mean()),
+            over=float((jnd > self.settings.tolerance).mean()),
             jnd=jnd,
-            forecast=0 if reason is not None else forecast,
+            forecast=forecast,
             nonfinite=int(statistics.nonfinite.sum()),
             stop_reason=reason,
         )
+
+    def _enough(self, predicted: float) -> StopReason | None:
+        """Return why the samples are enough, None where they are not."""
+        threshold = self.settings.noise_threshold
+        if threshold is None:
+            margin = UNBIASED if self.settings.unbiased else 1.0
+            return "tolerance" if predicted <= margin * self.settings.tolerance else None
+        noise = HalfBuffer().noise(self._statistics, self.size)
+        return "noise_threshold" if noise.max() <= threshold else None
+
+    def _wanted(self, model: Model, scale: float) -> Plane:
+        """Return how many finite samples every pixel is to have, (H, W)."""
+        threshold = self.settings.noise_threshold
+        if threshold is not None:
+            noise = HalfBuffer().noise(self._statistics, self.size)
+            growth = np.clip((noise / threshold) ** 2, SMALLEST_GROWTH, LARGEST_GROWTH)
+            alone: Plane = model.count * np.where(noise > threshold, growth, 1.0)
+            return alone
+        margin = UNBIASED if self.settings.unbiased else 1.0
+        goal = (AIM * margin * self.settings.tolerance / scale) ** model.exponent
+        wanted = self._strategy.wanted(model, self._statistics, goal)
+        if not (wanted > model.count).any():
+            # The boundary images see nothing where the simulation does.
+            wanted = 2.0 * model.count
+        return wanted
 
 
 def rounds(sampler: Sampler, renderer: Renderer, at_once: int = 2**20) -> Iterator[Report]:

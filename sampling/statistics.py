@@ -25,6 +25,9 @@ FIRST, SECOND = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 # multiple of this. So long as a run is not cut elsewhere, the batch leaves no trace in the bits.
 PIECE = 2**16
 
+# Samples that are folded in at once, which bounds memory. Status: choice, measured.
+AT_ONCE = 2**15
+
 
 class Statistics:
     """Count, RGB mean and co-moments of the samples of each of ``pixels`` pixels, in float64.
@@ -76,22 +79,16 @@ class Statistics:
         steps = np.diff(pixels)
         if pixels[0] < 0 or pixels[-1] >= len(self.drawn) or (steps < 0).any():
             raise ValueError(f"expected sorted pixel numbers from 0 to {len(self.drawn) - 1}")
-        starts = np.concatenate(([0], np.flatnonzero(steps) + 1))
-        runs, lengths = pixels[starts], np.diff(np.append(starts, len(pixels)))
-        finite = np.isfinite(radiance).all(1)
-        if self.half_count is not None:
-            number = np.arange(len(pixels)) - np.repeat(starts - self.drawn[runs], lengths)
-            self._add_halves(pixels, radiance, finite & (number % 2 == 0))
-        self.drawn[runs] += lengths
-        if not finite.all():
-            np.add.at(self.nonfinite, pixels[~finite], 1)
-            pixels, radiance = pixels[finite], radiance[finite]
-            if len(pixels) == 0:
-                return
-            starts = np.concatenate(([0], np.flatnonzero(np.diff(pixels)) + 1))
-            runs, lengths = pixels[starts], np.diff(np.append(starts, len(pixels)))
-        before = (self.count[runs] - lengths).astype(np.float64)
-        self._fold(runs, before, *_reduce(radiance, starts, lengths))
+        starts = np.concatenate(([0], np.flatnonzero(steps) + 1, [len(pixels)]))
+        # Whole runs at a time, about as many samples as stay in the processor's cache.
+        start = 0
+        while start < len(pixels):
+            last = max(int(np.searchsorted(starts, start + AT_ONCE, side="right")) - 1, 0)
+            stop = int(starts[last])
+            if stop <= start:
+                stop = int(starts[last + 1])
+            self._add(pixels[start:stop], radiance[start:stop])
+            start = stop
 
     def merge(self, other: Self) -> None:
         """Fold in the statistics of other samples of the same pixels."""
@@ -136,6 +133,27 @@ class Statistics:
             setattr(statistics, name, value.copy())
         return statistics
 
+    def _add(self, pixels: NDArray[np.int64], radiance: NDArray[np.float32]) -> None:
+        """Fold in whole runs."""
+        starts, lengths = _runs(pixels)
+        runs = pixels[starts]
+        finite = np.isfinite(radiance).all(1)
+        if self.half_count is not None:
+            number = np.arange(len(pixels)) - np.repeat(starts - self.drawn[runs], lengths)
+            self._add_halves(pixels, radiance, finite & (number % 2 == 0))
+        before = self.count[runs].astype(np.float64)
+        self.drawn[runs] += lengths
+        if not finite.all():
+            np.add.at(self.nonfinite, pixels[~finite], 1)
+            pixels, radiance = pixels[finite], radiance[finite]
+            if len(pixels) == 0:
+                return
+            kept = np.isin(runs, pixels)
+            before = before[kept]
+            starts, lengths = _runs(pixels)
+            runs = pixels[starts]
+        self._fold(runs, before, *_reduce(radiance, starts, lengths))
+
     def _add_halves(
         self, pixels: NDArray[np.int64], radiance: NDArray[np.float32], kept: NDArray[np.bool_]
     ) -> None:
@@ -143,8 +161,8 @@ class Statistics:
         if self.half_count is None or self.half_mean is None or not kept.any():
             return
         pixels, radiance = pixels[kept], radiance[kept]
-        starts = np.concatenate(([0], np.flatnonzero(np.diff(pixels)) + 1))
-        runs, lengths = pixels[starts], np.diff(np.append(starts, len(pixels)))
+        starts, lengths = _runs(pixels)
+        runs = pixels[starts]
         sums = np.add.reduceat(radiance.T.astype(np.float64), starts, axis=1)
         self.half_count[runs] += lengths
         self.half_mean[:, runs] += (sums - lengths * self.half_mean[:, runs]) / self.half_count[
@@ -180,6 +198,12 @@ class Statistics:
         self.higher[:, where] = old_higher + higher + np.stack((third, fourth))
         self.comoments[:, where] = old_comoments + comoments + step[FIRST] * step[SECOND] * share
         self.mean[:, where] = old_mean + step * share_added
+
+
+def _runs(pixels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return where the runs of equal numbers start, and their lengths."""
+    starts = np.concatenate(([0], np.flatnonzero(np.diff(pixels)) + 1))
+    return starts, np.diff(np.append(starts, len(pixels)))
 
 
 def scalar_second(comoments: Plane) -> Plane:

@@ -13,7 +13,6 @@ from torch.nn import functional
 
 from sampling.prediction import Model
 from sampling.statistics import Statistics
-from torch_vdm.quadtree import push
 
 Plane = NDArray[np.float64]
 
@@ -61,7 +60,7 @@ class Perceptual:
     halves = False
 
     def wanted(self, model: Model, statistics: Statistics, goal: float) -> Plane:
-        """Find the fewest samples in proportion to the shares at which the model predicts the goal."""
+        """Find the smallest growth along the shares at which the model predicts the goal."""
         del statistics
         worth = np.sqrt(model.shares() / model.count)
         worth /= max(float(worth.max()), 1e-300)

@@ -6,16 +6,25 @@ each is mixed with its parent's (empirical Bayes), by how much each of them know
 """
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch.nn import functional
 
 from sampling.statistics import FIRST, SECOND, Statistics, scalar_second
 
 Plane = NDArray[np.float64]
 
-# What the parent's variance is worth, in degrees of freedom of the node's own. A variance from n
-# samples with a kurtosis of k has 2 n / (k - 1): n for normal noise, and twice the number of
-# events where noise is rare events. Status: fitted to the honest stop, see docs/sampling.md.
+# The least that the parent's variance is worth, in degrees of freedom of the node's own. A
+# variance from n samples with a kurtosis of k has 2 n / (k - 1): n for normal noise, and twice
+# the number of events where noise is rare events. Status: choice, measured.
 PRIOR = 4.0
+
+# Most that it is ever worth. Status: choice.
+LARGEST_PRIOR = 1000.0
+
+# A relative distance between variances, squared, counts for no more. Status: choice; rare events
+# would otherwise speak for all their neighbours.
+FARTHEST = 4.0
 
 # Kurtosis of normal noise, where none has been seen.
 NORMAL = 3.0
@@ -47,13 +56,34 @@ def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
         second, fourth = scalar_second(parent[:6]), parent[6]
         kurtosis = _ratio(fourth, second * second, NORMAL)
         freedom = 2.0 * nodes[11] / np.maximum(kurtosis - 1.0, 1e-3)
+        # The mean, which scales what the parent knows, is shrunk by the least weight.
         weight = PRIOR / (PRIOR + freedom)
         mean = weight * parent_mean + (1.0 - weight) * own_mean
         scale = _ratio(np.abs(mean), np.abs(parent_mean), 1.0)
         scalar = scale.mean(0)
         prior = parent * np.concatenate((scale[FIRST] * scale[SECOND], scalar[None] ** 4))
+        worth = _worth(scalar_second(own[:6]), scalar_second(prior[:6]), freedom)
+        weight = worth / (worth + freedom)
         estimate = weight * prior + (1.0 - weight) * own
     return estimate[:6]
+
+
+def _worth(own: Plane, prior: Plane, freedom: Plane) -> Plane:
+    """Return what the prior is worth, in degrees of freedom, at every node.
+
+    How far the nodes' own variances lie from the prior, beyond what their few samples explain,
+    is how far the truth does: 2 over its square. Averaged over neighbours.
+    """
+    apart = _ratio(own, prior, 1.0) - 1.0
+    chance = 2.0 / np.maximum(freedom, 1e-3)
+    spread = _smooth(np.minimum(apart * apart, FARTHEST)) - _smooth(np.minimum(chance, FARTHEST))
+    return np.clip(2.0 / np.maximum(spread, 1e-9), PRIOR, LARGEST_PRIOR)
+
+
+def _smooth(plane: Plane) -> Plane:
+    """Return the mean over 5x5 nodes, fewer at the border."""
+    tensor = torch.from_numpy(plane)[None, None]
+    return functional.avg_pool2d(tensor, 5, 1, 2, count_include_pad=False)[0, 0].numpy()
 
 
 def _own(sums: Plane) -> tuple[Plane, Plane]:
@@ -62,7 +92,8 @@ def _own(sums: Plane) -> tuple[Plane, Plane]:
     About the means of the pixels, not of the node: a texture is no noise.
     """
     count = np.maximum(sums[11], 1.0)
-    return np.concatenate((sums[:6] / np.maximum(sums[10], 1.0), sums[6:7] / count)), sums[7:10] / count
+    covariance = sums[:6] / np.maximum(sums[10], 1.0)
+    return np.concatenate((covariance, sums[6:7] / count)), sums[7:10] / count
 
 
 def _ratio(over: Plane, under: Plane, otherwise: float) -> Plane:
