@@ -42,7 +42,7 @@ CHECKPOINT_SECONDS = 30.0
 
 # Samples between two looks at the clock: at first, and then as many as take about so long. Neither
 # changes a bit of the image. Status: choice; a call has to be large to be fast.
-FIRST_PART, SMALLEST_PART, LARGEST_PART = 2**16, 2**12, 2**21
+FIRST_PART, SMALLEST_PART, LARGEST_PART = 2**16, 2**12, 2**20
 PART_SECONDS = 0.5
 
 # Seconds between two changes of the live line.
@@ -536,7 +536,9 @@ class _RoundLines(_Line):
 
     def round(self, report: Report | None) -> None:
         if report is not None and (self._report is None or report.round != self._report.round):
-            print(f"vdm-render: {_words(report, self._tolerance)}", file=sys.stderr, flush=True)
+            words = [f"round {report.round}", f"{report.spp:.4g} samples per pixel"]
+            words += _seen(report, self._tolerance)
+            print(f"vdm-render: {' · '.join(words)}", file=sys.stderr, flush=True)
         self._report = report
 
 
@@ -556,24 +558,26 @@ class _LiveLine(_Line):
         if now - self._shown < LINE_SECONDS:
             return
         self._shown = now
-        words = ["round 1"]
-        if self._report is not None:
-            words = [_words(self._report, self._tolerance)]
+        report = self._report
+        words = [f"round {1 if report is None else report.round + 1}"]
+        if report is not None:
+            words += [f"{samples / report.jnd.size:.4g} samples per pixel"]
+            words += _seen(report, self._tolerance)
         words += [f"{speed / 1e6:.2f} million samples/s"]
-        if self._report is not None:
-            left = max(self._report.samples + self._report.forecast - samples, 0) / speed
+        if report is not None:
+            left = max(report.samples + report.forecast - samples, 0) / speed
             words += [f"{_clock(left)} left"]
         if ending:
             words += ["ending with this round (Ctrl-C again: at once)"]
         self._live.update(" · ".join(words), refresh=True)
 
 
-def _words(report: Report, tolerance: float) -> str:
-    """Return a round's report in words."""
-    return (
-        f"round {report.round} · {report.spp:.4g} samples per pixel · predicted maximum "
-        f"{report.predicted:.3g} JND · {100.0 * report.over:.3g} % over {tolerance:g}"
-    )
+def _seen(report: Report, tolerance: float) -> list[str]:
+    """Return what a round's decision saw."""
+    return [
+        f"predicted maximum {report.predicted:.3g} JND",
+        f"{100.0 * report.over:.3g} % over {tolerance:g}",
+    ]
 
 
 def _clock(seconds: float) -> str:

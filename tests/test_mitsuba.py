@@ -266,6 +266,8 @@ def test_scenes_that_are_refused(mitsuba: Any, tmp_path: Path, text: str, words:
 def test_unknown_parameters_missing_files_and_variants_are_refused(still_life: Path) -> None:
     with pytest.raises(SceneError, match=r"unused parameters: \$hue=3"):
         MitsubaRenderer(still_life, {"hue": "3"})
+    with pytest.raises(SceneError, match="cannot be given a parameter named 'filename'"):
+        MitsubaRenderer(still_life, {"filename": "3"})
     with pytest.raises(SceneError, match="no such file"):
         MitsubaRenderer(still_life.with_name("none.xml"))
     with pytest.raises(SceneError, match="a folder"):
@@ -308,6 +310,15 @@ def test_an_llvm_that_would_abort_is_refused(other_llvm: pytest.MonkeyPatch) -> 
     find_llvm.cache_clear()
     other_llvm.delenv(llvm.VARIABLE)
     assert find_llvm() is None
+
+
+def test_an_llvm_that_someone_else_chose_is_refused(
+    mitsuba: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del mitsuba
+    monkeypatch.setattr("drjit.detail.llvm_version", lambda: (15, 0, 6))
+    with pytest.raises(SceneError, match="expected LLVM 17 or newer, got 15"):
+        load_mitsuba()
 
 
 def test_without_llvm_it_warns_and_interprets(mitsuba: Any, other_llvm: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sampling.renderers.llvm import PACKAGE, VARIABLE, find_llvm
+from sampling.renderers.llvm import OLDEST, PACKAGE, VARIABLE, find_llvm
 from sampling.renderers.protocol import Samples
 
 # In the order of preference; all compute in linear BT.709.
@@ -27,7 +27,7 @@ VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 
 # Samples in one call of the compiled variants. Speed is flat from 3e5 on, and 27 bytes are needed
 # for each. Status: choice, measured.
-BATCH = 2**21
+BATCH = 2**20
 
 # What is asked of the `aov` integrator, in its own words, and how many numbers it gives.
 AOVS = "albedo:albedo,normal:sh_normal"
@@ -208,6 +208,12 @@ class MitsubaRenderer:
     def _parse(self) -> Any:
         """Read the file and what it includes, and hash all of it."""
         mi, parser = self._mi, self._mi.parser
+        for name in ("config", "filename"):
+            if name in self.parameters:
+                raise SceneError(
+                    f"{self.path}: Mitsuba cannot be given a parameter named {name!r}; "
+                    "call it otherwise in the scene"
+                )
         config = parser.ParserConfig(self.variant)
         try:
             state = parser.parse_file(config, os.fspath(self.path), **self.parameters)
@@ -298,7 +304,7 @@ def load_mitsuba(variant: str = "auto") -> Any:
     """
     if variant not in ("auto", *VARIANTS):
         raise SceneError(f"expected a variant among auto, {', '.join(VARIANTS)}, got {variant!r}")
-    llvm = find_llvm() if variant in ("auto", "llvm_ad_rgb") else None
+    llvm = find_llvm() is not None if variant in ("auto", "llvm_ad_rgb") else False
     try:
         mi = importlib.import_module("mitsuba")
         dr = importlib.import_module("drjit")
@@ -307,9 +313,16 @@ def load_mitsuba(variant: str = "auto") -> Any:
             f"expected Mitsuba 3.9, got none ({error}); install it with: "
             "pip install 'torch-vdm[render]'"
         ) from error
+    llvm = llvm and bool(dr.has_backend(dr.JitBackend.LLVM))
+    if llvm and dr.detail.llvm_version()[0] < OLDEST:
+        # Whoever imported Mitsuba before let Dr.Jit choose for itself, once and for all.
+        raise SceneError(
+            f"expected LLVM {OLDEST} or newer, got {dr.detail.llvm_version()[0]}, which was loaded "
+            f"when mitsuba was imported; load the scene before that, or set {VARIABLE}"
+        )
     usable = {
         "cuda_ad_rgb": bool(dr.has_backend(dr.JitBackend.CUDA)),
-        "llvm_ad_rgb": llvm is not None,
+        "llvm_ad_rgb": llvm,
         "scalar_rgb": True,
     }
     if variant == "auto":
