@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from sampling.boundary import QUARTILE, boundaries, detail_variances
+from sampling.boundary import NONE, QUARTILE, boundaries, detail_variances
 from sampling.error import maximum, total
 from sampling.statistics import FIRST, SECOND, Statistics
 from sampling.variance import pooled_covariance
@@ -29,6 +29,9 @@ QUANTILE, INEXACT = 2.2, 0.05
 
 # Power that stands for a maximum where a derivative is needed. Status: choice, measured.
 SHARPNESS = 4.0
+
+# Variances of itself that a single detail must have to be taken for one. Status: choice, measured.
+DOUBT = 9.0
 
 # Numbers of one simulated plane that are computed at once. Status: choice.
 AT_ONCE = 2**18
@@ -155,14 +158,15 @@ def _to_cones(metric: VDM) -> Tensor:
 
 
 def _shrunk(detail: Tensor, variance: Tensor) -> Tensor:
-    """Return d max(0, 1 - V / d^2), with d^2 its mean over 3x3 nodes where that is smaller.
+    """Return the details less the noise in them, d max(0, 1 - V / d^2), twice over.
 
-    The mean alone would leave the noise beside an edge as it is, and itself alone what noise has
-    raised by chance.
+    With d^2 its mean over 3x3 nodes, which finds a texture; beside an edge that mean leaves the
+    noise as it is, so the detail by itself must pass too, and pass `DOUBT` variances.
     """
     power = detail * detail
-    power = torch.minimum(power, _around(power))
-    share = torch.where(power > 0.0, variance / torch.where(power > 0.0, power, 1.0), 1.0)
+    share = torch.maximum(
+        _around(variance) / _around(power).clamp_min(NONE), DOUBT * variance / power.clamp_min(NONE)
+    )
     return detail * (1.0 - share).clamp_min(0.0)
 
 
