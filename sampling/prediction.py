@@ -58,12 +58,13 @@ class Model:
         seen = (statistics.count > 0).reshape(size)
         self.single = pooled_covariance(statistics, size) * seen
         self.mean = torch.from_numpy(statistics.mean.reshape(1, 3, *size))
+        self.true_means = metric.observer.true_means
         self.exponent = metric.observer.summation_exponent
         with torch.no_grad():
             self.cortex = metric.represent(self.mean)
         self.to_cones = _to_cones(metric)
         self.variance = self._cone_variance(self.count)
-        self.details = detail_variances(self.variance)
+        self.details = detail_variances(self.variance, self.true_means)
         self.truth = self.cortex._replace(
             details=tuple(
                 _shrunk(detail, variance)
@@ -96,7 +97,7 @@ class Model:
     def _totals(self, variance: Tensor) -> Tensor:
         lower, upper = boundaries(
             self.truth,
-            detail_variances(variance),
+            detail_variances(variance, self.true_means),
             variance.mean((-2, -1), keepdim=True) / variance[0, 0].numel(),
             QUARTILE,
             self.metric.observer.signed,
@@ -123,7 +124,7 @@ class Model:
             normal = torch.from_numpy(generator.standard_normal((batch, 3, height, width)))
             noise = torch.einsum("ijhw,bjhw->bihw", factor, normal)
             noise = torch.einsum("ij,bjhw->bihw", self.to_cones, noise)
-            added = self.metric.transform.decompose(noise)
+            added = self.metric.transform.decompose(noise, true_means=self.true_means)
             first = _batch(self.truth, batch)
             second = Cortex(
                 tuple(a + b for a, b in zip(first.details, added.details, strict=True)),
