@@ -3,11 +3,12 @@
 "Refine error estimate" and "construct boundary images" of Fig. 8.
 """
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from torch_vdm.cortex import Cortex
-from torch_vdm.quadtree import pad_even
 
 # Distance of the quartiles of a normal distribution from its mean, in standard deviations.
 QUARTILE = 0.6744897501960817
@@ -16,42 +17,85 @@ QUARTILE = 0.6744897501960817
 NONE = 1e-200
 
 
-def detail_variances(leaves: Tensor) -> tuple[Tensor, ...]:
+class _Axis(NamedTuple):
+    """What the nodes along one axis add to each of their parents: two nodes a parent."""
+
+    nodes: Tensor
+    """(2, n), the numbers of the nodes."""
+    low: Tensor
+    """(2, n), their squared weights in the sum of a detail that does not run along this axis."""
+    high: Tensor
+    """(2, n), in its difference."""
+    own: Tensor
+    """(2, n), in the mean of the parent's own pixels."""
+
+
+def detail_variances(leaves: Tensor, true_means: bool) -> tuple[Tensor, ...]:
     """Return the variances of the detail coefficients of independent leaves (Section 3).
 
-    The variance of an interior node is the sum of its four children's over 16; its details have
-    the same. Where an odd side repeats its last row or column, the two copies are one number: what
-    they add to counts twice its deviation, and what subtracts them has no variance.
+    Inside the image those of a node, and that of its lowpass, are the sum of its four children's
+    over 16. At the border of an odd side they follow what `Haar.decompose` makes of it.
 
     Parameters
     ----------
     leaves
         (B, C, H, W), not negative.
+    true_means
+        As for `Haar.decompose`.
 
     Returns
     -------
     tuple of Tensor
         One (B, C, 3, h, w) a level, level 0 first: d1 (horizontal), d2 (vertical), d3 (diagonal).
     """
+    size = (leaves.shape[-2], leaves.shape[-1])
     levels: list[Tensor] = []
     nodes = leaves
     while max(nodes.shape[-2:]) > 1:
-        height, width = nodes.shape[-2:]
-        even = pad_even(nodes)
-        rows = even[..., 0::2, :] + even[..., 1::2, :]
-        lowpass = (rows[..., 0::2] + rows[..., 1::2]) / 16.0
-        if height % 2:
-            lowpass[..., -1, :] *= 2.0
-        if width % 2:
-            lowpass[..., -1] *= 2.0
-        details = lowpass.unsqueeze(2).repeat(1, 1, 3, 1, 1)
-        if height % 2:
-            details[:, :, 1:, -1] = 0.0
-        if width % 2:
-            details[:, :, 0::2, :, -1] = 0.0
-        levels.append(details)
-        nodes = lowpass
+        y, x = (
+            _axis(side, 2 ** len(levels), nodes.shape[axis], true_means)
+            for side, axis in zip(size, (-2, -1), strict=True)
+        )
+        upper, lower = nodes[..., y.nodes[0], :], nodes[..., y.nodes[1], :]
+
+        def across(
+            weights: Tensor, upper: Tensor = upper, lower: Tensor = lower, x: _Axis = x
+        ) -> tuple[Tensor, Tensor]:
+            rows = weights[0, :, None] * upper + weights[1, :, None] * lower
+            return rows[..., x.nodes[0]], rows[..., x.nodes[1]]
+
+        (left, right), (left_high, right_high) = across(y.low), across(y.high)
+        details = (
+            x.high[0] * left + x.high[1] * right,
+            x.low[0] * left_high + x.low[1] * right_high,
+            x.high[0] * left_high + x.high[1] * right_high,
+        )
+        levels.append(torch.stack(details, 2))
+        left, right = across(y.own)
+        nodes = x.own[0] * left + x.own[1] * right
     return tuple(reversed(levels))
+
+
+def _axis(side: int, node: int, count: int, true_means: bool) -> _Axis:
+    """Return the weights along a side of ``side`` pixels in ``count`` nodes of ``node`` pixels."""
+    parents = (count + 1) // 2
+    nodes = torch.arange(2 * parents).view(parents, 2).T.contiguous()
+    low = torch.full((2, parents), 0.25, dtype=torch.float64)
+    high, own = low.clone(), low.clone()
+    share = (side % node or node) / node
+    if count % 2 == 1:
+        # The last node has no sibling: its window reaches back over its neighbour, or it stands
+        # beside itself.
+        step = share / (1.0 + share) if true_means and count > 1 else 0.0
+        nodes[:, -1] = torch.tensor([count - 1, max(count - 2, 0)])
+        low[:, -1] = torch.tensor([(1.0 - step) ** 2, step**2], dtype=torch.float64)
+        high[:, -1] = step**2
+        own[:, -1] = torch.tensor([1.0, 0.0])
+    elif true_means:
+        step = share / (1.0 + share)
+        low[:, -1] = own[:, -1] = torch.tensor([(1.0 - step) ** 2, step**2], dtype=torch.float64)
+        high[:, -1] = step**2
+    return _Axis(nodes, low, high, own)
 
 
 def boundaries(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from sampling.boundary import QUARTILE, boundaries, detail_variances
+from sampling.boundary import NONE, QUARTILE, boundaries, detail_variances
 from sampling.error import maximum, total
 from sampling.statistics import FIRST, SECOND, Statistics
 from sampling.variance import pooled_covariance
@@ -29,6 +29,9 @@ QUANTILE, INEXACT = 2.2, 0.05
 
 # Power that stands for a maximum where a derivative is needed. Status: choice, measured.
 SHARPNESS = 4.0
+
+# Variances of itself that a single detail must have to be taken for one. Status: choice, measured.
+DOUBT = 9.0
 
 # Numbers of one simulated plane that are computed at once. Status: choice.
 AT_ONCE = 2**18
@@ -55,12 +58,13 @@ class Model:
         seen = (statistics.count > 0).reshape(size)
         self.single = pooled_covariance(statistics, size) * seen
         self.mean = torch.from_numpy(statistics.mean.reshape(1, 3, *size))
+        self.true_means = metric.observer.true_means
         self.exponent = metric.observer.summation_exponent
         with torch.no_grad():
             self.cortex = metric.represent(self.mean)
         self.to_cones = _to_cones(metric)
         self.variance = self._cone_variance(self.count)
-        self.details = detail_variances(self.variance)
+        self.details = detail_variances(self.variance, self.true_means)
         self.truth = self.cortex._replace(
             details=tuple(
                 _shrunk(detail, variance)
@@ -93,7 +97,7 @@ class Model:
     def _totals(self, variance: Tensor) -> Tensor:
         lower, upper = boundaries(
             self.truth,
-            detail_variances(variance),
+            detail_variances(variance, self.true_means),
             variance.mean((-2, -1), keepdim=True) / variance[0, 0].numel(),
             QUARTILE,
             self.metric.observer.signed,
@@ -120,7 +124,7 @@ class Model:
             normal = torch.from_numpy(generator.standard_normal((batch, 3, height, width)))
             noise = torch.einsum("ijhw,bjhw->bihw", factor, normal)
             noise = torch.einsum("ij,bjhw->bihw", self.to_cones, noise)
-            added = self.metric.transform.decompose(noise)
+            added = self.metric.transform.decompose(noise, true_means=self.true_means)
             first = _batch(self.truth, batch)
             second = Cortex(
                 tuple(a + b for a, b in zip(first.details, added.details, strict=True)),
@@ -155,14 +159,15 @@ def _to_cones(metric: VDM) -> Tensor:
 
 
 def _shrunk(detail: Tensor, variance: Tensor) -> Tensor:
-    """Return d max(0, 1 - V / d^2), with d^2 its mean over 3x3 nodes where that is smaller.
+    """Return the details less the noise in them, d max(0, 1 - V / d^2), twice over.
 
-    The mean alone would leave the noise beside an edge as it is, and itself alone what noise has
-    raised by chance.
+    With d^2 its mean over 3x3 nodes, which finds a texture; beside an edge that mean leaves the
+    noise as it is, so the detail by itself must pass too, and pass `DOUBT` variances.
     """
     power = detail * detail
-    power = torch.minimum(power, _around(power))
-    share = torch.where(power > 0.0, variance / torch.where(power > 0.0, power, 1.0), 1.0)
+    share = torch.maximum(
+        _around(variance) / _around(power).clamp_min(NONE), DOUBT * variance / power.clamp_min(NONE)
+    )
     return detail * (1.0 - share).clamp_min(0.0)
 
 

@@ -16,7 +16,7 @@ from sampling.renderers import Renderer, Samples
 from sampling.statistics import FIRST, PIECE, SECOND, Statistics
 from sampling.strategies import LARGEST_GROWTH, SMALLEST_GROWTH, STRATEGIES, HalfBuffer
 from sampling.variance import pooled_covariance
-from torch_vdm import VDM
+from torch_vdm import VDM, Haar
 from torch_vdm.quadtree import push
 
 Plane = NDArray[np.float64]
@@ -169,14 +169,14 @@ class Sampler:
     size
         Height and width in pixels.
     metric
-        Who judges; its display must be linear, or XYZ.
+        Who judges; its display must be linear, or XYZ, and its transform `Haar`.
     settings
         What the user chose.
 
     Raises
     ------
     ValueError
-        Where the size has a 0 or the display is not linear in the samples.
+        Where the size has a 0, or the metric's display is not linear, or its transform not `Haar`.
     """
 
     def __init__(
@@ -186,6 +186,8 @@ class Sampler:
             raise ValueError(f"expected a height and width of at least 1, got {size}")
         if metric.display.encoding == "srgb":
             raise ValueError("expected a metric with a linear display, got sRGB-coded values")
+        if not isinstance(metric.transform, Haar):
+            raise ValueError(f"expected a metric on the Haar transform, got {metric.transform}")
         self.size = (int(size[0]), int(size[1]))
         self.metric = metric
         self.settings = settings or Settings()

@@ -11,18 +11,19 @@ from sampling.boundary import QUARTILE, boundaries, detail_variances
 from torch_vdm import Haar
 from torch_vdm.cortex import Cortex
 
-SIZES = [(1, 2), (2, 2), (8, 8), (5, 7), (3, 1), (6, 11)]
+SIZES = [(1, 2), (2, 2), (8, 8), (5, 7), (3, 1), (6, 11), (9, 12)]
 
 
+@pytest.mark.parametrize("true_means", [False, True])
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_variances_are_those_of_a_linear_map(height: int, width: int) -> None:
+def test_variances_are_those_of_a_linear_map(height: int, width: int, true_means: bool) -> None:
     variance = torch.rand(1, 1, height, width, dtype=torch.float64)
     # The response to an impulse in each pixel: what each coefficient is made of.
     impulses = torch.eye(height * width, dtype=torch.float64).view(-1, 1, height, width)
-    found = detail_variances(variance)
+    found = detail_variances(variance, true_means)
     expected = [
         (detail**2 * variance.view(-1, 1, 1, 1, 1)).sum(0, keepdim=True)
-        for detail in Haar().decompose(impulses).details
+        for detail in Haar().decompose(impulses, true_means=true_means).details
     ]
     assert len(found) == len(expected)
     for one, other in zip(found, expected, strict=True):
@@ -31,20 +32,26 @@ def test_variances_are_those_of_a_linear_map(height: int, width: int) -> None:
 
 def test_an_interior_node_has_a_sixteenth_of_its_children() -> None:
     variance = torch.rand(2, 3, 4, 4, dtype=torch.float64)
-    coarse, fine = detail_variances(variance)
+    coarse, fine = detail_variances(variance, true_means=True)
     for y in range(2):
         for x in range(2):
             block = variance[:, :, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2].sum((-2, -1)) / 16.0
             for orientation in range(3):
                 torch.testing.assert_close(fine[:, :, orientation, y, x], block)
-    torch.testing.assert_close(coarse[..., 0, 0], variance.sum((-2, -1))[..., None].repeat(1, 1, 3) / 256)
+    torch.testing.assert_close(
+        coarse[..., 0, 0], variance.sum((-2, -1))[..., None].repeat(1, 1, 3) / 256
+    )
 
 
 def made(seed: int) -> tuple[Cortex, tuple[Tensor, ...], Tensor]:
     generator = torch.Generator().manual_seed(seed)
     plane = torch.rand(1, 3, 8, 8, generator=generator, dtype=torch.float64)
     noise = 0.1 * torch.rand(1, 3, 8, 8, generator=generator, dtype=torch.float64)
-    return Haar().decompose(plane), detail_variances(noise), noise.mean((-2, -1), keepdim=True) / 64
+    return (
+        Haar().decompose(plane),
+        detail_variances(noise, true_means=True),
+        noise.mean((-2, -1), keepdim=True) / 64,
+    )
 
 
 @pytest.mark.parametrize("signed", [False, True])

@@ -8,16 +8,18 @@ import pywt
 import torch
 
 from tests.conftest import KINDS, make_xyz
-from tests.reference import paper
+from tests.reference import calibrated, paper
 from torch_vdm.cortex import Haar
 
 
+@pytest.mark.parametrize("true_means", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("size", [(1, 1), (1, 9), (6, 1), (8, 8), (13, 21)])
-def test_is_the_reference(kind: str, size: tuple[int, int]) -> None:
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (6, 1), (8, 8), (13, 21), (12, 33)])
+def test_is_the_reference(kind: str, size: tuple[int, int], true_means: bool) -> None:
     planes = make_xyz(kind, *size, 3)
-    expected = paper.cortex_filtering(planes)
-    actual = Haar().decompose(torch.from_numpy(planes)[None])
+    reference = calibrated if true_means else paper
+    expected = reference.cortex_filtering(planes)
+    actual = Haar().decompose(torch.from_numpy(planes)[None], true_means=true_means)
     assert len(actual.details) == paper.level_count(*size)
     rounding = 1e-15 * float(np.abs(planes).max())
     for ours, theirs in zip(actual.details, expected.details, strict=True):
@@ -63,6 +65,15 @@ def test_peaks_at_64_pixels_per_degree() -> None:
     cpd = [64.0 * frequency for frequency in frequencies]
     np.testing.assert_allclose(cpd, [32, 12.5, 6.01, 2.98, 1.49, 0.74], rtol=5e-3)
     np.testing.assert_allclose(gains, [1, 0.770, 0.735, 0.727, 0.725, 0.725], atol=6e-4)
+
+
+@pytest.mark.parametrize("size", [(8, 8), (13, 21), (1, 33), (65, 64)])
+def test_every_pixel_has_the_same_weight_in_true_means(size: tuple[int, int]) -> None:
+    planes = torch.rand(
+        1, 3, *size, dtype=torch.float64, generator=torch.Generator().manual_seed(2)
+    )
+    cortex = Haar().decompose(planes, true_means=True)
+    torch.testing.assert_close(cortex.lowpass[0], planes.mean((-2, -1), keepdim=True))
 
 
 def test_flat_images_have_no_details() -> None:

@@ -60,7 +60,9 @@ def test_every_level_has_the_same_largest_total(height: int, width: int) -> None
     assert largest == pytest.approx([float(maximum(local)[0])] * len(local), rel=1e-12)
 
 
-@pytest.mark.parametrize("observer", [Observer.paper(), Observer.calibrated()], ids=lambda o: o.name)
+@pytest.mark.parametrize(
+    "observer", [Observer.paper(), Observer.calibrated()], ids=lambda o: o.name
+)
 def test_the_finest_totals_are_the_metrics_own_map(observer: Observer) -> None:
     metric = VDM(60.0, Display.linear(), observer)
     generator = torch.Generator().manual_seed(4)

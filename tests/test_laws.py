@@ -81,6 +81,22 @@ def test_padding_by_repetition_does_not_matter() -> None:
     )
 
 
+@pytest.mark.parametrize("size", [65, 95, 100, 127, 129])
+@pytest.mark.parametrize("pixel", [(0, 0), (0, -1), (-1, 0), (-1, -1)])
+def test_the_border_of_an_odd_side_weighs_no_more(size: int, pixel: tuple[int, int]) -> None:
+    # One white pixel in a corner, where the far corner has no share in it: as at 64 x 64.
+    def seen(side: int, y: int, x: int) -> tuple[float, float]:
+        flat = torch.full((1, 3, side, side), 0.5)
+        dotted = flat.clone()
+        dotted[..., y, x] = 1.0
+        jnd = VDM(PPD)(dotted, flat)[0, 0]
+        return jnd[y, x].item(), jnd[-1 - y, -1 - x].item()
+
+    (near, far), (expected_near, expected_far) = seen(size, *pixel), seen(64, *pixel)
+    assert 0.7 * expected_near < near < 1.4 * expected_near
+    assert far < 1.2 * expected_far
+
+
 @each_observer
 def test_the_layout_in_memory_does_not_matter(observer: Observer) -> None:
     image = random_images(1, 2, 33, 31)

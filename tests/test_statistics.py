@@ -107,7 +107,7 @@ def test_halves_are_the_samples_of_even_number() -> None:
 
 
 def test_constant_pixels_have_exactly_no_variance() -> None:
-    value = np.float32([0.1, 1e6, 3e-7])
+    value = np.array([0.1, 1e6, 3e-7], np.float32)
     statistics = Statistics(1)
     for length in (1, 5, 1000):
         statistics.add(Samples(np.zeros(length, np.int64), np.tile(value, (length, 1))))

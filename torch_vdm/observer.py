@@ -14,6 +14,9 @@ class Observer:
         What tables and JSON files call this observer.
     signed
         Whether responses keep the sign of a detail. False: Eq. 4 on the energy, as printed.
+    true_means
+        Whether a node at the border of an odd side counts for the pixels that it has. False: for
+        as many as its siblings, the last row or column repeated.
     dark_light
         The eye's own light, as an equal-energy light in cd/m2, added to what the eye adapts to.
     aberration_cutoff, aberration_exponent
@@ -45,6 +48,7 @@ class Observer:
 
     name: str
     signed: bool
+    true_means: bool
     dark_light: float
     aberration_cutoff: float
     aberration_exponent: float
@@ -76,6 +80,7 @@ class Observer:
         return cls(
             name="paper",
             signed=False,  # printed: Eq. 4 takes the energy
+            true_means=False,  # choice: repeated level by level, the plainest reading
             dark_light=1e-4,  # cd/m2, choice: only keeps a division by 0 finite
             aberration_cutoff=4.4,  # cpd, fitted to the paper's sentence: < half at 4, none over 8
             aberration_exponent=2.0,
@@ -104,6 +109,7 @@ class Observer:
         return cls(
             name="calibrated",
             signed=True,  # choice: a grating and its negative differ
+            true_means=True,  # choice: else one odd pixel outweighs half of the image
             dark_light=0.02,  # cd/m2, choice
             aberration_cutoff=5.24,  # cpd, fitted to a diffraction and defocus model of the eye
             aberration_exponent=2.15,

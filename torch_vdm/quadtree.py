@@ -6,6 +6,7 @@ column, level by level: padding the whole image to a square power of two would c
 pixels at 1920 x 1080.
 """
 
+import torch
 from torch import Tensor
 from torch.nn import functional
 
@@ -16,6 +17,52 @@ def pad_even(plane: Tensor) -> Tensor:
     if height % 2 == 0 and width % 2 == 0:
         return plane
     return functional.pad(plane, (0, width % 2, 0, height % 2), mode="replicate")
+
+
+def complete(plane: Tensor, size: tuple[int, int], node: int) -> Tensor:
+    """Pad ``plane`` to even sides so that no pixel weighs more than another.
+
+    ``plane`` (B, C, h, w) holds the means of nodes of ``node`` x ``node`` pixels, a power of two,
+    of an image of ``size`` = (H, W) pixels. The last row or column R may hold only the share r of
+    its pixels. As a second sibling, after L, it becomes L + 2 r / (1 + r) (R - L): (L + R) / 2 is
+    then the mean of the real pixels of both. As a first it gets, in the place of the sibling that
+    it lacks, R + 2 r / (1 + r) (L - R), so that its details are those of a window over the border
+    and L, its neighbour. In both the detail tends to 0 with r.
+
+    The lowpass of a window is not that of its node; see `own`.
+    """
+    for side, axis in zip(size, (-2, -1), strict=True):
+        nodes = plane.shape[axis]
+        share = (side % node or node) / node
+        if nodes == 1 or (nodes % 2 == 0 and share == 1.0):
+            continue
+        before, last = plane.narrow(axis, nodes - 2, 1), plane.narrow(axis, nodes - 1, 1)
+        step = 2.0 * share / (1.0 + share) * (last - before)
+        if nodes % 2 == 0:
+            plane = torch.cat((plane.narrow(axis, 0, nodes - 1), before + step), axis)
+        else:
+            plane = torch.cat((plane, last - step), axis)
+    return pad_even(plane)
+
+
+def own(lowpass: Tensor, details: Tensor, size: tuple[int, int]) -> Tensor:
+    """Give the border nodes of a decomposed `complete` plane the mean of their own pixels.
+
+    ``lowpass`` (B, C, h / 2, w / 2) and ``details`` (B, C, 3, h / 2, w / 2) are those of Eq. 2;
+    ``size`` is (h, w) before it was completed. The first sibling alone is the sum of the lowpass
+    and the detail.
+    """
+    horizontal, vertical, diagonal = details.unbind(2)
+    if size[1] % 2 == 1:
+        alone = lowpass[..., -1:] + horizontal[..., -1:]
+        lowpass = torch.cat((lowpass[..., :-1], alone), -1)
+        vertical = torch.cat(
+            (vertical[..., -1:, :-1], vertical[..., -1:, -1:] + diagonal[..., -1:, -1:]), -1
+        )
+    if size[0] % 2 == 1:
+        alone = lowpass[..., -1:, :] + vertical[..., -1:, :]
+        lowpass = torch.cat((lowpass[..., :-1, :], alone), -2)
+    return lowpass
 
 
 def push(nodes: Tensor, size: tuple[int, int]) -> Tensor:

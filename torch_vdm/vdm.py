@@ -215,7 +215,7 @@ class VDM(nn.Module):
         else:
             rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
             planes = torch.cat([_light(part, *around) for part in image.split(rows, -2)], -2)
-        return self.transform.decompose(planes, self._fast)
+        return self.transform.decompose(planes, self._fast, self.observer.true_means)
 
     def respond(self, cortex: Cortex) -> tuple[Tensor, ...]:
         """Return the responses of one image: chromatic aberration to the transducer.

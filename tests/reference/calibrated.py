@@ -20,8 +20,9 @@ from .paper import (
     chromatic_aberration,
     cone_dark_light,
     cone_fundamentals,
-    cortex_filtering,
+    haar_step,
     half_width,
+    level_count,
     level_frequency,
     local_contrast,
     local_visual_difference,
@@ -104,6 +105,74 @@ class SignedResponses:
     luminance: tuple[Array, ...]
     weighted: tuple[Array, ...]
     response: tuple[Array, ...]
+
+
+# Cortex filtering
+
+
+def block(n: int, node: int, side: int) -> slice:
+    """Pixels of node ``n`` of an axis of ``side`` pixels, ``node`` pixels to a node."""
+    return slice(n * node, min((n + 1) * node, side))
+
+
+def border_window(plane: Array, node: int, side: int) -> Array:
+    """Make the number of columns of ``plane`` even, and the last detail that of real pixels.
+
+    Where the last column R has b of its a = ``node`` pixels and the one before it, L, has all:
+
+    - an even number: the detail is b (L - R) / (a + b) and the lowpass (a L + b R) / (a + b), the
+      mean of the pixels of both. R is replaced by what makes Eq. 2 give both;
+    - an odd number: R has no sibling. L is its partner, and the detail is b (R - L) / (a + b);
+    - one column: repeated.
+
+    Parameters
+    ----------
+    plane
+        Lowpass (h, w) of one cone.
+    node, side
+        Pixels in a whole column of ``plane``, and in the image's row.
+    """
+    height, width = plane.shape
+    if width == 1:
+        return np.concatenate((plane, plane), axis=1)
+    pixels = block(width - 1, node, side)
+    b = pixels.stop - pixels.start
+    columns = [plane[:, x].copy() for x in range(width)]
+    left, right = columns[-2], columns[-1]
+    if width % 2 == 0:
+        columns[-1] = 2 * (node * left + b * right) / (node + b) - left
+    else:
+        columns.append(right - 2 * b * (right - left) / (node + b))
+    return np.stack(columns, axis=1)
+
+
+def cortex_filtering(sml: Array) -> Pyramid:
+    """Eq. 2 from the pixels to the root, where every pixel has the same weight.
+
+    The lowpass of a node is the mean of the pixels that it has.
+
+    Parameters
+    ----------
+    sml
+        S, M, L (3, H, W), cd/m2.
+    """
+    _, rows, columns = sml.shape
+    lowpass = [sml]
+    details: list[Array] = []
+    for up in range(level_count(rows, columns)):
+        node = 2**up
+        step = []
+        for plane in lowpass[0]:
+            window = border_window(border_window(plane.T, node, rows).T, node, columns)
+            step.append(haar_step(window)[1])
+        details.insert(0, np.stack(step, axis=1))
+        means = np.zeros((3, *details[0].shape[-2:]))
+        for cone, y, x in np.ndindex(means.shape):
+            means[cone, y, x] = sml[
+                cone, block(y, 2 * node, rows), block(x, 2 * node, columns)
+            ].mean()
+        lowpass.insert(0, means)
+    return Pyramid(tuple(lowpass), tuple(details))
 
 
 # CSF filtering
@@ -291,8 +360,7 @@ def lowpass_term(
     float
         JND to the power ``summation_exponent``.
     """
-    # The last lowpass is the cone image. Its plain mean: in the root's own node the repeated
-    # border of an odd side would count for more than it is.
+    # The last lowpass is the cone image.
     contrast = lowpass_contrast(
         test.lowpass[-1].mean((1, 2)), reference.lowpass[-1].mean((1, 2)), parameters.dark_light
     )

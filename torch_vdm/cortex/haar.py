@@ -9,27 +9,36 @@ from torch import Tensor
 
 from torch_vdm.cortex.transform import Cortex
 from torch_vdm.fast import SMALLEST, compiled
-from torch_vdm.quadtree import pad_even
+from torch_vdm.quadtree import complete, own, pad_even
 
 
 @dataclass(frozen=True)
 class Haar:
     """The paper's transform: O(N), one coefficient a pixel and cone, not shift-invariant."""
 
-    def decompose(self, planes: Tensor, fast: bool = False) -> Cortex:
+    def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:
         """Decompose (B, C, H, W) by Eq. 2 down to one node, by compiled steps if ``fast``.
+
+        ``true_means``: a node at the border counts for the pixels that it has. Else for as many
+        as its siblings, as the repeated last row or column of an odd side makes it.
 
         Returns
         -------
         Cortex
             ``details[l]`` is (B, C, 3, h, w): d1 (horizontal), d2 (vertical), d3 (diagonal).
         """
+        size = (planes.shape[-2], planes.shape[-1])
         mean = planes.mean((-2, -1), keepdim=True)
         details: list[Tensor] = []
         lowpass: list[Tensor] = []
         while max(planes.shape[-2:]) > 1:
             step = compiled(_analyse) if fast and planes.numel() >= SMALLEST else _analyse
-            planes, detail = step(pad_even(planes))
+            if true_means:
+                nodes = (planes.shape[-2], planes.shape[-1])
+                planes, detail = step(complete(planes, size, 2 ** len(details)))
+                planes = own(planes, detail, nodes)
+            else:
+                planes, detail = step(pad_even(planes))
             details.append(detail)
             lowpass.append(planes)
         return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [planes])), mean)

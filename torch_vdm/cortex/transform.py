@@ -17,7 +17,7 @@ class Cortex(NamedTuple):
         image of one pixel has no details and one lowpass, itself.
     mean
         (B, cones, 1, 1), the mean of the image. Not the root's lowpass, in which the repeated
-        border of an odd side counts for more than it is.
+        border of an odd side may count for more than it is.
     """
 
     details: tuple[Tensor, ...]
@@ -32,8 +32,11 @@ class Cortex(NamedTuple):
 class Transform(Protocol):
     """A decomposition into levels on a quad-tree, and what each level responds to."""
 
-    def decompose(self, planes: Tensor, fast: bool = False) -> Cortex:
-        """Decompose (B, C, H, W) to the coarsest level, by compiled steps if ``fast``."""
+    def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:
+        """Decompose (B, C, H, W) to the coarsest level, by compiled steps if ``fast``.
+
+        ``true_means``: no pixel counts for more than another, at the border of an odd side too.
+        """
 
     def peak(self, level_from_finest: int) -> tuple[float, float]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there."""
