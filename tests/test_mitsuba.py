@@ -2,6 +2,7 @@
 
 import math
 import re
+import subprocess
 import sys
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from sampling.renderers import Samples, llvm
 from sampling.renderers.llvm import LLVMError, find_llvm
 from sampling.renderers.mitsuba import MitsubaRenderer, SceneError, load_mitsuba
+from tests.conftest import ROOT
 
 # A lens, a shutter, fog and a window cut out of the picture, in one scene.
 FOG = """
@@ -113,6 +115,21 @@ def test_sample_k_of_a_pixel_is_the_same_number_however_it_is_drawn(
     one = whole.sample(np.array([60]), np.array([2]), np.array([1]))
     np.testing.assert_array_equal(one.radiance, wanted[60, 2:3])
     assert whole.sample(pixels[:0], first[:0], count[:0]).radiance.shape == (0, 3)
+
+
+def test_another_process_without_llvm_draws_the_same(still_life: Path, tmp_path: Path) -> None:
+    parameters = {"width": "6", "height": "4"}
+    code = f"""if True:
+        import numpy as np
+        from sampling.renderers.mitsuba import MitsubaRenderer
+        renderer = MitsubaRenderer({str(still_life)!r}, {parameters}, variant="scalar_rgb")
+        pixels = np.arange(24)
+        samples = renderer.sample(pixels, 0 * pixels, 0 * pixels + 5)
+        np.save({str(tmp_path / "radiance.npy")!r}, samples.radiance)
+    """
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+    here = draw(MitsubaRenderer(still_life, parameters, variant="scalar_rgb"), 5)
+    np.testing.assert_array_equal(np.load(tmp_path / "radiance.npy"), here.radiance)
 
 
 def test_seeds_pixels_and_samples_have_numbers_of_their_own(still_life: Path) -> None:

@@ -269,10 +269,9 @@ class MitsubaRenderer:
             raise SceneError(
                 f'{self.path}: expected an integrator, got none; add <integrator type="path"/>'
             )
-        differentiable = mi.python.ad.integrators.common.ADIntegrator
-        if not isinstance(integrator, mi.SamplingIntegrator) or isinstance(
-            integrator, differentiable
-        ):
+        # Those in Python are sampled in another way, and their base is not always loaded.
+        names = {kind.__name__ for kind in type(integrator).__mro__}
+        if not isinstance(integrator, mi.SamplingIntegrator) or "ADIntegrator" in names:
             raise SceneError(
                 f"{self.path}: expected an integrator that samples single rays, such as path, "
                 f"volpath or direct, got {integrator.class_name()}"
