@@ -14,10 +14,6 @@ from sampling.renderers import Samples
 
 Plane = NDArray[np.float64]
 
-# Weights of R, G, B in the scalar whose third and fourth moments are kept. Status: choice; equal
-# ones, for events of any colour must show.
-SCALAR = np.full(3, 1.0 / 3.0)
-
 # Rows and columns of the six co-moments that are kept of the symmetric 3x3 matrix.
 FIRST, SECOND = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 
@@ -184,7 +180,7 @@ class Statistics:
         total = np.maximum(before + added, 1.0)
         step = mean - old_mean
         share = before * added / total
-        shift = SCALAR @ step
+        shift = _scalar(step)
         old_second, second = scalar_second(old_comoments), scalar_second(comoments)
         old_share, share_added = before / total, added / total
         third = shift**3 * share * (old_share - share_added) + 3.0 * shift * (
@@ -207,10 +203,16 @@ def _runs(pixels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int6
 
 
 def scalar_second(comoments: Plane) -> Plane:
-    """Return the second moment of the scalar from the co-moments, (P,)."""
-    twice = np.where(FIRST == SECOND, 1.0, 2.0)
-    weights: Plane = SCALAR[FIRST] * SCALAR[SECOND] * twice
-    return np.tensordot(weights, comoments, 1)
+    """Return the second moment of the scalar (R + G + B) / 3 from the co-moments, (6, ...)."""
+    rr, rg, rb, gg, gb, bb = comoments
+    second: Plane = (rr + gg + bb + 2.0 * (rg + rb + gb)) / 9.0
+    return second
+
+
+def _scalar(colour: Plane) -> Plane:
+    """Return (R + G + B) / 3 of (3, ...). No matrix product: its bits depend on the length."""
+    scalar: Plane = (colour[0] + colour[1] + colour[2]) / 3.0
+    return scalar
 
 
 def _reduce(
@@ -224,7 +226,7 @@ def _reduce(
     columns = radiance.T
     count = lengths.astype(np.float64)
     origin = columns[:, starts].astype(np.float64)
-    shifted = columns - np.repeat(origin, lengths, axis=1)
+    shifted: Plane = columns.astype(np.float64) - np.repeat(origin, lengths, axis=1)
     mean = np.add.reduceat(shifted, starts, axis=1) / count
     comoments = np.empty((6, len(starts)))
     for row, (one, other) in enumerate(zip(FIRST, SECOND, strict=True)):
@@ -232,8 +234,8 @@ def _reduce(
         comoments[row] = products - count * mean[one] * mean[other]
     diagonal = FIRST == SECOND
     comoments[diagonal] = np.maximum(comoments[diagonal], 0.0)
-    scalar = SCALAR @ shifted
-    centre = SCALAR @ mean
+    scalar = _scalar(shifted)
+    centre = _scalar(mean)
     scalar -= np.repeat(centre, lengths)
     square = scalar * scalar
     third = np.add.reduceat(square * scalar, starts)
