@@ -33,6 +33,8 @@ class Statistics:
 
     Attributes
     ----------
+    first
+        (P,), int64: the number of the first sample that is drawn.
     drawn, nonfinite
         (P,), int64: samples drawn, and how many of them were not finite.
     mean
@@ -45,7 +47,10 @@ class Statistics:
         (P,) and (3, P): count and mean of the samples of even number; None where not asked for.
     """
 
-    def __init__(self, pixels: int, halves: bool = False) -> None:
+    def __init__(
+        self, pixels: int, halves: bool = False, first: NDArray[np.int64] | None = None
+    ) -> None:
+        self.first = np.zeros(pixels, np.int64) if first is None else first.copy()
         self.drawn = np.zeros(pixels, np.int64)
         self.nonfinite = np.zeros(pixels, np.int64)
         self.mean = np.zeros((3, pixels))
@@ -75,14 +80,18 @@ class Statistics:
         steps = np.diff(pixels)
         if pixels[0] < 0 or pixels[-1] >= len(self.drawn) or (steps < 0).any():
             raise ValueError(f"expected sorted pixel numbers from 0 to {len(self.drawn) - 1}")
-        starts = np.concatenate(([0], np.flatnonzero(steps) + 1, [len(pixels)]))
-        # Whole runs at a time, about as many samples as stay in the processor's cache.
+        starts, lengths = _runs(pixels)
+        cuts = self._cuts(pixels[starts], starts, lengths)
+        ends = np.union1d(np.append(starts[1:], len(pixels)), cuts)
+        # Whole runs at a time, about as many samples as stay in the processor's cache, and never
+        # two pieces of one run.
         start = 0
         while start < len(pixels):
-            last = max(int(np.searchsorted(starts, start + AT_ONCE, side="right")) - 1, 0)
-            stop = int(starts[last])
-            if stop <= start:
-                stop = int(starts[last + 1])
+            whole = ends[np.searchsorted(ends, start, side="right") :]
+            stop = int(whole[max(int(np.searchsorted(whole, start + AT_ONCE, "right")) - 1, 0)])
+            following = int(np.searchsorted(cuts, start, side="right"))
+            if following < len(cuts):
+                stop = min(stop, int(cuts[following]))
             self._add(pixels[start:stop], radiance[start:stop])
             start = stop
 
@@ -128,6 +137,17 @@ class Statistics:
         for name, value in state.items():
             setattr(statistics, name, value.copy())
         return statistics
+
+    def _cuts(
+        self, runs: NDArray[np.int64], starts: NDArray[np.int64], lengths: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """Return where in the samples a run goes on at a multiple of `PIECE`."""
+        number = self.first[runs] + self.drawn[runs]
+        inside = (number + lengths - 1) // PIECE - number // PIECE
+        of = np.repeat(np.arange(len(runs)), inside)
+        place = np.arange(len(of)) - np.repeat(np.cumsum(inside) - inside, inside) + 1
+        cuts: NDArray[np.int64] = starts[of] + (number[of] // PIECE + place) * PIECE - number[of]
+        return cuts
 
     def _add(self, pixels: NDArray[np.int64], radiance: NDArray[np.float32]) -> None:
         """Fold in whole runs."""
