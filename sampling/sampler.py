@@ -108,8 +108,9 @@ class Request:
     def parts(self, at_once: int) -> Iterator["Request"]:
         """Yield the request in parts of at most about ``at_once`` samples, in order.
 
-        A pixel's run is cut only at multiples of `PIECE`, so that the size of a batch leaves no
-        trace in the bits of the result; a part may thus have up to `PIECE` samples more.
+        A pixel's run is cut only at multiples of `PIECE`, as `Statistics` cuts it, so that the
+        size of a batch leaves no trace in the bits of the result. A part may thus be as large as
+        `PIECE`.
         """
         # Where each run is cut: at every multiple of PIECE inside it.
         pieces = (self.first + self.count - 1) // PIECE - self.first // PIECE + 1
@@ -125,7 +126,10 @@ class Request:
             drawn = ends[start - 1] if start else 0
             stop = max(start + 1, int(np.searchsorted(ends, drawn + at_once, side="right")))
             part = slice(start, stop)
-            yield Request(self.pixels[of[part]], low[part], (high - low)[part])
+            # Pieces of one run that fall into one part are one run of it.
+            head = np.flatnonzero(np.diff(of[part], prepend=-1))
+            count = np.add.reduceat((high - low)[part], head)
+            yield Request(self.pixels[of[part][head]], low[part][head], count)
             start = stop
 
 
@@ -192,11 +196,10 @@ class Sampler:
         self.metric = metric
         self.settings = settings or Settings()
         self._strategy = STRATEGIES[self.settings.strategy]
-        self._statistics = self._empty()
+        self._statistics = Statistics(self.size[0] * self.size[1], self._strategy.halves)
         self._target = np.full(self.size[0] * self.size[1], self._pilot(), np.int64)
         self._rounds = 0
-        # Of an unbiased run, once it has decided: what it drew for that, and why it stopped.
-        self._before = np.zeros_like(self._target)
+        # Of an unbiased run, once it has decided: why it stopped.
         self._decided: StopReason | None = None
         self._report: Report | None = None
 
@@ -210,8 +213,8 @@ class Sampler:
             left = self._left()
             if not left.any():
                 return None
-        pixels = np.flatnonzero(left)
-        return Request(pixels, (self._before + self._statistics.drawn)[pixels], left[pixels])
+        pixels, statistics = np.flatnonzero(left), self._statistics
+        return Request(pixels, (statistics.first + statistics.drawn)[pixels], left[pixels])
 
     def tell(self, samples: Samples) -> None:
         """Fold in samples: the parts of what was asked, in order."""
@@ -250,7 +253,6 @@ class Sampler:
             "width": self.size[1],
             "rounds": self._rounds,
             "decided": self._decided,
-            "before": self._before.copy(),
             "target": self._target.copy(),
             **{f"settings.{name}": value for name, value in asdict(self.settings).items()},
             **{f"statistics.{name}": a.copy() for name, a in self._statistics.state().items()},
@@ -274,15 +276,11 @@ class Sampler:
         sampler = cls(size, metric, Settings(**_under("settings.", state)))
         sampler._rounds = int(state["rounds"])
         sampler._decided = state["decided"]
-        sampler._before = np.array(state["before"], np.int64)
         sampler._target = np.array(state["target"], np.int64)
         sampler._statistics = Statistics.restored(_under("statistics.", state))
         report = _under("report.", state)
         sampler._report = Report(**report) if report else None
         return sampler
-
-    def _empty(self) -> Statistics:
-        return Statistics(self.size[0] * self.size[1], self._strategy.halves)
 
     def _left(self) -> NDArray[np.int64]:
         return self._target - self._statistics.drawn
@@ -305,7 +303,7 @@ class Sampler:
         # The boundary images say where, the simulation how much.
         scale = predicted / largest if largest > 0.0 else 1.0
         jnd = push(totals, self.size)[0, 0].numpy() ** (1.0 / model.exponent) * scale
-        drawn = int((self._before + statistics.drawn).sum())
+        drawn = int((statistics.first + statistics.drawn).sum())
         forecast, reason = 0, self._decided
         if reason is None:
             reason = self._enough(predicted)
@@ -326,9 +324,10 @@ class Sampler:
             if reason is not None and not shown:
                 # The same numbers of samples once more, on which nothing has been decided.
                 self._decided, reason = reason, None
-                self._before = statistics.drawn
                 self._target = statistics.drawn.copy()
-                self._statistics = self._empty()
+                self._statistics = Statistics(
+                    len(self._target), self._strategy.halves, first=statistics.drawn
+                )
             if not shown:
                 forecast = 2 * forecast + int(self._target.sum())
         self._rounds += 1

@@ -14,10 +14,6 @@ from sampling.renderers import Samples
 
 Plane = NDArray[np.float64]
 
-# Weights of R, G, B in the scalar whose third and fourth moments are kept. Status: choice; equal
-# ones, for events of any colour must show.
-SCALAR = np.full(3, 1.0 / 3.0)
-
 # Rows and columns of the six co-moments that are kept of the symmetric 3x3 matrix.
 FIRST, SECOND = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 
@@ -37,6 +33,8 @@ class Statistics:
 
     Attributes
     ----------
+    first
+        (P,), int64: the number of the first sample that is drawn.
     drawn, nonfinite
         (P,), int64: samples drawn, and how many of them were not finite.
     mean
@@ -49,7 +47,10 @@ class Statistics:
         (P,) and (3, P): count and mean of the samples of even number; None where not asked for.
     """
 
-    def __init__(self, pixels: int, halves: bool = False) -> None:
+    def __init__(
+        self, pixels: int, halves: bool = False, first: NDArray[np.int64] | None = None
+    ) -> None:
+        self.first = np.zeros(pixels, np.int64) if first is None else first.copy()
         self.drawn = np.zeros(pixels, np.int64)
         self.nonfinite = np.zeros(pixels, np.int64)
         self.mean = np.zeros((3, pixels))
@@ -79,14 +80,18 @@ class Statistics:
         steps = np.diff(pixels)
         if pixels[0] < 0 or pixels[-1] >= len(self.drawn) or (steps < 0).any():
             raise ValueError(f"expected sorted pixel numbers from 0 to {len(self.drawn) - 1}")
-        starts = np.concatenate(([0], np.flatnonzero(steps) + 1, [len(pixels)]))
-        # Whole runs at a time, about as many samples as stay in the processor's cache.
+        starts, lengths = _runs(pixels)
+        cuts = self._cuts(pixels[starts], starts, lengths)
+        ends = np.union1d(np.append(starts[1:], len(pixels)), cuts)
+        # Whole runs at a time, about as many samples as stay in the processor's cache, and never
+        # two pieces of one run.
         start = 0
         while start < len(pixels):
-            last = max(int(np.searchsorted(starts, start + AT_ONCE, side="right")) - 1, 0)
-            stop = int(starts[last])
-            if stop <= start:
-                stop = int(starts[last + 1])
+            whole = ends[np.searchsorted(ends, start, side="right") :]
+            stop = int(whole[max(int(np.searchsorted(whole, start + AT_ONCE, "right")) - 1, 0)])
+            following = int(np.searchsorted(cuts, start, side="right"))
+            if following < len(cuts):
+                stop = min(stop, int(cuts[following]))
             self._add(pixels[start:stop], radiance[start:stop])
             start = stop
 
@@ -132,6 +137,17 @@ class Statistics:
         for name, value in state.items():
             setattr(statistics, name, value.copy())
         return statistics
+
+    def _cuts(
+        self, runs: NDArray[np.int64], starts: NDArray[np.int64], lengths: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """Return where in the samples a run goes on at a multiple of `PIECE`."""
+        number = self.first[runs] + self.drawn[runs]
+        inside = (number + lengths - 1) // PIECE - number // PIECE
+        of = np.repeat(np.arange(len(runs)), inside)
+        place = np.arange(len(of)) - np.repeat(np.cumsum(inside) - inside, inside) + 1
+        cuts: NDArray[np.int64] = starts[of] + (number[of] // PIECE + place) * PIECE - number[of]
+        return cuts
 
     def _add(self, pixels: NDArray[np.int64], radiance: NDArray[np.float32]) -> None:
         """Fold in whole runs."""
@@ -184,7 +200,7 @@ class Statistics:
         total = np.maximum(before + added, 1.0)
         step = mean - old_mean
         share = before * added / total
-        shift = SCALAR @ step
+        shift = _scalar(step)
         old_second, second = scalar_second(old_comoments), scalar_second(comoments)
         old_share, share_added = before / total, added / total
         third = shift**3 * share * (old_share - share_added) + 3.0 * shift * (
@@ -207,10 +223,16 @@ def _runs(pixels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int6
 
 
 def scalar_second(comoments: Plane) -> Plane:
-    """Return the second moment of the scalar from the co-moments, (P,)."""
-    twice = np.where(FIRST == SECOND, 1.0, 2.0)
-    weights: Plane = SCALAR[FIRST] * SCALAR[SECOND] * twice
-    return np.tensordot(weights, comoments, 1)
+    """Return the second moment of the scalar (R + G + B) / 3 from the co-moments, (6, ...)."""
+    rr, rg, rb, gg, gb, bb = comoments
+    second: Plane = (rr + gg + bb + 2.0 * (rg + rb + gb)) / 9.0
+    return second
+
+
+def _scalar(colour: Plane) -> Plane:
+    """Return (R + G + B) / 3 of (3, ...). No matrix product: its bits depend on the length."""
+    scalar: Plane = (colour[0] + colour[1] + colour[2]) / 3.0
+    return scalar
 
 
 def _reduce(
@@ -224,7 +246,7 @@ def _reduce(
     columns = radiance.T
     count = lengths.astype(np.float64)
     origin = columns[:, starts].astype(np.float64)
-    shifted = columns - np.repeat(origin, lengths, axis=1)
+    shifted: Plane = columns.astype(np.float64) - np.repeat(origin, lengths, axis=1)
     mean = np.add.reduceat(shifted, starts, axis=1) / count
     comoments = np.empty((6, len(starts)))
     for row, (one, other) in enumerate(zip(FIRST, SECOND, strict=True)):
@@ -232,8 +254,8 @@ def _reduce(
         comoments[row] = products - count * mean[one] * mean[other]
     diagonal = FIRST == SECOND
     comoments[diagonal] = np.maximum(comoments[diagonal], 0.0)
-    scalar = SCALAR @ shifted
-    centre = SCALAR @ mean
+    scalar = _scalar(shifted)
+    centre = _scalar(mean)
     scalar -= np.repeat(centre, lengths)
     square = scalar * scalar
     third = np.add.reduceat(square * scalar, starts)

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sampling.renderers import Samples
-from sampling.statistics import FIRST, SECOND, Statistics
+from sampling.sampler import Request
+from sampling.statistics import FIRST, PIECE, SECOND, Statistics
 
 PIXELS = 7
 
@@ -123,6 +124,28 @@ def test_a_bright_pixel_loses_no_digits() -> None:
     for part in radiance.reshape(10, 100, 3):
         statistics.add(Samples(np.zeros(100, np.int64), part))
     np.testing.assert_allclose(statistics.covariance(), 250.0 / 999.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("first", [0, 70000])
+def test_batches_cut_at_pieces_leave_no_trace(first: int) -> None:
+    count = np.array([3, 2 * PIECE + 5, 0, PIECE - 3, 9, 1, 70000])
+    samples = draw(2, count)
+    start = np.full(PIXELS, first)
+    whole = Statistics(PIXELS, first=start)
+    whole.add(samples)
+    pieces = Statistics(PIXELS, first=start)
+    request = Request(np.flatnonzero(count), start[count > 0], count[count > 0])
+    begin = 0
+    for part in request.parts(1000):
+        end = begin + part.samples
+        pieces.add(Samples(samples.pixels[begin:end], samples.radiance[begin:end]))
+        begin = end
+    assert begin == count.sum()
+    for name, value in whole.state().items():
+        np.testing.assert_array_equal(pieces.state()[name], value)
+    oracle = of_pixel([samples], 1)
+    np.testing.assert_allclose(whole.mean[:, 1], oracle.mean(0), rtol=1e-12)
+    np.testing.assert_allclose(whole.covariance()[:, 1], np.cov(oracle.T)[FIRST, SECOND], rtol=1e-9)
 
 
 def test_samples_that_are_not_finite_are_counted_and_nowhere_else() -> None:
