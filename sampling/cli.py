@@ -323,7 +323,8 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
             variant=options.variant,
         )
     for warning in told:
-        print(f"vdm-render: warning: {warning.message}", file=sys.stderr)
+        if warning.category is UserWarning:  # the renderer's own, not what libraries deprecate
+            print(f"vdm-render: warning: {warning.message}", file=sys.stderr)
     # The sampler's own state says which settings it has; the rest is said here.
     height, width = renderer.size
     identity = {
