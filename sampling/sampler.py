@@ -30,10 +30,6 @@ STATE_VERSION = 1
 # Share of the tolerance that a round aims at, for a prediction is not exact. Status: choice.
 AIM = 0.98
 
-# Share of the tolerance at which an unbiased run ends its decisions. Status: fitted to the honest
-# stop, see docs/sampling.md.
-UNBIASED = 1.0
-
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
@@ -52,8 +48,8 @@ class Settings:
     noise_threshold
         The half-buffer's own stop, in the unit of its error; None: stop on ``tolerance``.
     unbiased
-        Decide on one set of samples and show another: when the run has reached its (smaller)
-        tolerance, the same numbers of samples are drawn anew, and only these make the image.
+        Decide on one set of samples and show another: when the run would stop, the same numbers
+        of samples are drawn anew, and only these make the image.
 
     Raises
     ------
@@ -347,8 +343,7 @@ class Sampler:
         """Return why the samples are enough, None where they are not."""
         threshold = self.settings.noise_threshold
         if threshold is None:
-            margin = UNBIASED if self.settings.unbiased else 1.0
-            return "tolerance" if predicted <= margin * self.settings.tolerance else None
+            return "tolerance" if predicted <= self.settings.tolerance else None
         noise = HalfBuffer().noise(self._statistics, self.size)
         return "noise_threshold" if noise.max() <= threshold else None
 
@@ -360,8 +355,7 @@ class Sampler:
             growth = np.clip((noise / threshold) ** 2, SMALLEST_GROWTH, LARGEST_GROWTH)
             alone: Plane = model.count * np.where(noise > threshold, growth, 1.0)
             return alone
-        margin = UNBIASED if self.settings.unbiased else 1.0
-        goal = (AIM * margin * self.settings.tolerance / scale) ** model.exponent
+        goal = (AIM * self.settings.tolerance / scale) ** model.exponent
         wanted = self._strategy.wanted(model, self._statistics, goal)
         if not (wanted > model.count).any():
             # The boundary images see nothing where the simulation does.

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from sampling import Report, Request, Sampler, Samples, Settings, rounds
 from sampling.renderers.synthetic import Synthetic
-from sampling.sampler import UNBIASED
 from sampling.statistics import PIECE
 from sampling.strategies import STRATEGIES
 from torch_vdm import VDM, Display, Observer
@@ -219,7 +218,7 @@ def test_an_unbiased_image_is_of_samples_that_decided_nothing() -> None:
     reports = finished(sampler, renderer)
     assert len(renderer.drawn) == len(set(renderer.drawn)) == reports[-1].samples
     assert 2 * sampler.count.sum() == reports[-1].samples
-    assert reports[-2].predicted <= UNBIASED * 4.0
+    assert reports[-2].predicted <= 4.0
     # The second half of every pixel's numbers makes the image.
     half = sampler.count.reshape(-1)
     pixels = np.arange(len(half))
