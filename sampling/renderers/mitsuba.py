@@ -242,7 +242,8 @@ class MitsubaRenderer:
         for file in [Path(str(file)) for file in included] + [
             file for file in found if _is_file(file)
         ]:
-            digest.update(hashlib.sha256(file.read_bytes()).digest())
+            with file.open("rb") as content:
+                digest.update(hashlib.file_digest(content, "sha256").digest())
         self.fingerprint = digest.hexdigest()
         return state
 
@@ -466,6 +467,7 @@ def _plan(
     return {
         "integrator": name,
         "max_depth": depth,
+        "sensor": f"the first of {len(scene.sensors())}",
         "pixel_filter": "box",
         "pixel_filter_why": f"samples of a pixel stay in it; the scene's film asks for {rfilter}",
         "effects": [
