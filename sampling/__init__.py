@@ -1,5 +1,6 @@
 """Adaptive rendering: samples go where their error would be seen (Section 3 of the paper)."""
 
 from sampling.renderers import Renderer, Samples
+from sampling.sampler import Report, Request, Sampler, Settings, rounds
 
-__all__ = ["Renderer", "Samples"]
+__all__ = ["Renderer", "Report", "Request", "Sampler", "Samples", "Settings", "rounds"]

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import stat
 import struct
 import subprocess
@@ -22,7 +23,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from torch_vdm.io import ImageError, atomic_path, load, read_image, write_image
+from torch_vdm.io import (
+    ImageError,
+    atomic_path,
+    load,
+    read_image,
+    write_channels,
+    write_image,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -986,6 +994,39 @@ def test_one_picture_in_three_encodings(shared_data: Path, name: str) -> None:
     torch.testing.assert_close(
         smooth(actual[None], 32), smooth(wanted[None], 32), rtol=0.02, atol=0.02
     )
+
+
+def test_named_channels_are_kept_and_the_picture_is_read_from_them(tmp_path: Path) -> None:
+    path = tmp_path / "render.exr"
+    names = "R", "G", "B", "samples", "variance.R", "normal.X"
+    wanted = dict(zip(names, planes(len(names)), strict=True))
+    write_channels(path, {name: torch.from_numpy(plane) for name, plane in wanted.items()})
+    written = OpenEXR.File(str(path), separate_channels=True).channels()
+    assert set(written) == set(names)
+    for name, plane in wanted.items():
+        np.testing.assert_array_equal(written[name].pixels, plane)
+    picture = load(path)
+    np.testing.assert_array_equal(picture.pixels, np.stack([wanted[name] for name in "RGB"]))
+    assert picture.notes == ("Channels that are not used: normal.X, samples, variance.R.",)
+
+
+@pytest.mark.parametrize(
+    ("name", "shapes", "words"),
+    [
+        ("render.png", [(2, 3)], "ends in .exr"),
+        ("render.exr", [(2, 3), (3, 2)], "one shape"),
+        ("render.exr", [(0, 3)], "at least one pixel"),
+        ("render.exr", [], "one shape"),
+        ("nowhere/render.exr", [(2, 3)], "expected the folder to exist"),
+    ],
+)
+def test_named_channels_that_are_refused(
+    tmp_path: Path, name: str, shapes: list[tuple[int, int]], words: str
+) -> None:
+    channels = {str(i): torch.zeros(shape) for i, shape in enumerate(shapes)}
+    with pytest.raises(ImageError, match=re.escape(words)):
+        write_channels(tmp_path / name, channels)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_openexr_project_damaged_files(shared_data: Path, tmp_path: Path) -> None:

@@ -52,10 +52,11 @@ class _UsageError(ValueError):
     """Options that do not fit together."""
 
 
-class _Parser(argparse.ArgumentParser):
+class Parser(argparse.ArgumentParser):
     """A parser whose errors are one line."""
 
     def error(self, message: str) -> NoReturn:
+        """Print the message and end with status 2."""
         print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
         raise SystemExit(BAD_INPUT)
 
@@ -83,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = Parser(
         prog="torch-vdm",
         description="Tell whether anybody can see the difference between two images, and where.",
     )
@@ -110,23 +111,23 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_options(parser: argparse.ArgumentParser, map_path: Path | None) -> None:
     view = parser.add_argument_group("viewing")
-    view.add_argument("--ppd", type=_positive, metavar="F", help=f"pixels per degree ({PPD:g})")
+    view.add_argument("--ppd", type=positive, metavar="F", help=f"pixels per degree ({PPD:g})")
     view.add_argument(
         "--screen", type=_resolution, metavar="WxH", help="instead of --ppd: the screen's pixels"
     )
-    view.add_argument("--diagonal", type=_positive, metavar="INCHES", help="its diagonal")
-    view.add_argument("--distance", type=_positive, metavar="METRES", help="from eye to screen")
+    view.add_argument("--diagonal", type=positive, metavar="INCHES", help="its diagonal")
+    view.add_argument("--distance", type=positive, metavar="METRES", help="from eye to screen")
     light = parser.add_argument_group("light")
     light.add_argument(
         "--peak",
-        type=_positive,
+        type=positive,
         default=WHITE,
         metavar="CD_M2",
         help=f"luminance of white in PNG and JPEG ({WHITE:g})",
     )
     light.add_argument(
         "--white",
-        type=_positive,
+        type=positive,
         default=WHITE,
         metavar="CD_M2",
         help=f"luminance of 1.0 in EXR ({WHITE:g})",
@@ -221,12 +222,12 @@ def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
     elif options.map is not None:
         write_heat_map(options.map, *pair.coded(), jnd, comparison.verdict())
     if options.json == "-":
-        _tell(comparison.to_json())
+        tell(comparison.to_json())
     else:
         if options.json is not None:
             with atomic_path(Path(options.json)) as temporary:
                 temporary.write_text(comparison.to_json())
-        _tell(_text(comparison, luminances, options))
+        tell(_text(comparison, luminances, options))
     exceeded = options.fail_above is not None and comparison.max_jnd > options.fail_above
     return EXCEEDED if exceeded else DONE
 
@@ -247,7 +248,7 @@ def _check_outputs(inputs: tuple[Path, Path], options: argparse.Namespace) -> No
         taken[target] = path
 
 
-def _tell(text: str) -> None:
+def tell(text: str) -> None:
     """Print, and do not mind a reader that has read enough."""
     try:
         sys.stdout.write(text)
@@ -365,7 +366,7 @@ def _part(text: str | None) -> int | str | None:
     return int(text) if text is not None and text.isdecimal() else text
 
 
-def _number(text: str, what: str, low: float, high: float = math.inf) -> float:
+def number(text: str, what: str, low: float, high: float = math.inf) -> float:
     """Return ``text`` as a finite number over ``low`` and at most ``high``."""
     try:
         value = float(text)
@@ -376,16 +377,17 @@ def _number(text: str, what: str, low: float, high: float = math.inf) -> float:
     return value
 
 
-def _positive(text: str) -> float:
-    return _number(text, "a number over 0", 0.0)
+def positive(text: str) -> float:
+    """Return ``text`` as a finite number over 0."""
+    return number(text, "a number over 0", 0.0)
 
 
 def _jnd(text: str) -> float:
-    return _number(text, "a number of JND, 0 or more", -math.ulp(0.0))
+    return number(text, "a number of JND, 0 or more", -math.ulp(0.0))
 
 
 def _stops(text: str) -> float:
-    return _number(text, "a number of stops between -32 and 32", math.nextafter(-32.0, -64.0), 32.0)
+    return number(text, "a number of stops between -32 and 32", math.nextafter(-32.0, -64.0), 32.0)
 
 
 def _resolution(text: str) -> tuple[int, int]:

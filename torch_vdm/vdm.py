@@ -261,11 +261,19 @@ class VDM(PairMetric):
         """
         constants = self._constants(first.lowpass[0].dtype)
         root = self.lowpass_difference(first, second) ** constants["summation_exponent"]
-        local = [
+        local = self.local_differences(first, second)
+        return accumulate(local, root.sum(1, keepdim=True))
+
+    def local_differences(self, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
+        """Return the local visual difference of every node (Eq. 5), before the root.
+
+        One (B, 1, h, w) a level, level 0 first.
+        """
+        constants = self._constants(first.lowpass[0].dtype)
+        return tuple(
             self._local_difference(first, second, number, level, constants)
             for number, level in enumerate(self._levels(first, constants))
-        ]
-        return accumulate(local, root.sum(1, keepdim=True))
+        )
 
     def _local_difference(
         self,

@@ -6,6 +6,7 @@ from torch_vdm.io.files import (
     check_target,
     load,
     read_image,
+    write_channels,
     write_image,
 )
 from torch_vdm.io.refusal import ImageError
@@ -17,5 +18,6 @@ __all__ = [
     "check_target",
     "load",
     "read_image",
+    "write_channels",
     "write_image",
 ]

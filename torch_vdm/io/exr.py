@@ -10,6 +10,7 @@ OpenEXR is imported where it is used: importing the package stays fast.
 
 import io
 import struct
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -233,8 +234,8 @@ def _decoded(data: bytes, names: tuple[str, ...]) -> list[Floats]:
     return [parts[0].channels[name].pixels.astype(np.float32) for name in names]
 
 
-def encode_exr(planes: Floats) -> bytes:
-    """Return (3, H, W) or (1, H, W) as a file of float channels R, G, B or Y."""
+def encode_exr(channels: Mapping[str, Floats]) -> bytes:
+    """Return planes (H, W) as a file of float channels of these names."""
     import OpenEXR
 
     header = {
@@ -242,10 +243,7 @@ def encode_exr(planes: Floats) -> bytes:
         "type": OpenEXR.scanlineimage,
         "chromaticities": BT709,
     }
-    names = "Y" if len(planes) == 1 else "RGB"
-    channels = {
-        name: np.ascontiguousarray(plane) for name, plane in zip(names, planes, strict=True)
-    }
     stream = io.BytesIO()
-    OpenEXR.File(header, channels).write(stream)
+    planes = {name: np.ascontiguousarray(plane) for name, plane in channels.items()}
+    OpenEXR.File(header, planes).write(stream)
     return stream.getvalue()

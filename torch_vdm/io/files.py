@@ -8,7 +8,7 @@ import stat
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -173,9 +173,44 @@ def write_image(path: PathLike, image: Tensor) -> None:
         )
     planes: Floats = image.detach().to("cpu", torch.float32).reshape(-1, *shape[-2:]).numpy()
     try:
-        encoded = encode_exr(planes) if suffix == ".exr" else encode_coded(planes, FORMATS[suffix])
+        if suffix == ".exr":
+            encoded = encode_exr(dict(zip("Y" if len(planes) == 1 else "RGB", planes, strict=True)))
+        else:
+            encoded = encode_coded(planes, FORMATS[suffix])
     except ImageError as error:
         raise ImageError(f"{os.fspath(path)}: {error}") from error.__cause__
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(encoded)
+
+
+def write_channels(path: PathLike, channels: Mapping[str, Tensor]) -> None:
+    """Write an OpenEXR file of 32-bit float channels of any names, whole or not at all.
+
+    Parameters
+    ----------
+    path
+        The file, whose name ends in ``.exr``; one that exists is replaced once the new one is
+        complete.
+    channels
+        Planes (H, W) of one size by the names of their channels. R, G, B are linear BT.709; others
+        are what their names say.
+
+    Raises
+    ------
+    ImageError
+        If the suffix is another one, the planes differ in size, or the file cannot be written.
+    """
+    if Path(path).suffix.lower() != ".exr":
+        raise ImageError(f"{os.fspath(path)}: expected a name that ends in .exr")
+    shapes = {tuple(plane.shape) for plane in channels.values()}
+    if len(shapes) != 1 or any(len(shape) != 2 or 0 in shape for shape in shapes):
+        raise ImageError(
+            f"{os.fspath(path)}: expected channels of one shape (H, W) with at least one pixel, "
+            f"got {sorted(shapes)}"
+        )
+    encoded = encode_exr(
+        {name: plane.detach().to("cpu", torch.float32).numpy() for name, plane in channels.items()}
+    )
     with atomic_path(path) as temporary:
         temporary.write_bytes(encoded)
 

@@ -1,0 +1,59 @@
+"""The trees of local, maximum and total error.
+
+"Local visual difference prediction" and "update maximum error tree" of Fig. 8. The local errors
+come from `VDM.local_differences`, in JND to the power of the summation, 2.4.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from torch_vdm.quadtree import push
+
+
+def maximum(local: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """Return for each node its local error plus the largest maximum among its children.
+
+    Parameters
+    ----------
+    local
+        One (B, 1, h, w) a level, level 0 (the root) first.
+
+    Returns
+    -------
+    tuple of Tensor
+        The same shapes. Level 0: the largest error along any path of the tree.
+    """
+    levels = [local[-1]]
+    for nodes in reversed(local[:-1]):
+        below = functional.max_pool2d(levels[-1], 2, ceil_mode=True)
+        levels.append(nodes + below)
+    return tuple(reversed(levels))
+
+
+def total(local: Sequence[Tensor], largest: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """Return for each node the local errors on the path to it plus its maximum error.
+
+    Parameters
+    ----------
+    local
+        One (B, 1, h, w) a level, level 0 first.
+    largest
+        What `maximum` gives for it.
+
+    Returns
+    -------
+    tuple of Tensor
+        The same shapes. Level 0, and the largest of each level, are the largest of the tree; the
+        finest level is the error accumulated down every path.
+    """
+    levels: list[Tensor] = []
+    above = torch.zeros_like(local[0])
+    for nodes, below in zip(local, largest, strict=True):
+        size = (nodes.shape[-2], nodes.shape[-1])
+        path = push(above, size) if levels else above
+        levels.append(path + below)
+        above = path + nodes
+    return tuple(levels)

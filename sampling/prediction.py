@@ -1,0 +1,204 @@
+"""What the samples say of the visible difference between the current image and the converged one.
+
+Two predictions from one set of statistics. *Boundary images* (the paper's) say where the error
+is: they place samples. *Simulation* says how large its maximum is: it stops.
+"""
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from sampling.boundary import NONE, QUARTILE, boundaries, detail_variances
+from sampling.error import maximum, total
+from sampling.statistics import FIRST, SECOND, Statistics
+from sampling.variance import pooled_covariance
+from torch_vdm import VDM
+from torch_vdm.cortex import Cortex
+
+# Images that are simulated for one prediction. Status: choice.
+DRAWS = 16
+
+# The predicted maximum lies this many standard deviations over the mean of the simulated ones;
+# their own variance, and that of the prediction's error, as a share of the mean, are added.
+# Status: fitted to the honest stop, see docs/sampling.md.
+QUANTILE, INEXACT = 2.2, 0.05
+
+# Power that stands for a maximum where a derivative is needed. Status: choice, measured.
+SHARPNESS = 4.0
+
+# Variances of itself that a single detail must have to be taken for one. Status: choice, measured.
+DOUBT = 9.0
+
+# Numbers of one simulated plane that are computed at once. Status: choice.
+AT_ONCE = 2**18
+
+
+class Model:
+    """The statistics of a round, as the metric sees them.
+
+    Parameters
+    ----------
+    metric
+        Who judges.
+    statistics
+        Of the samples so far.
+    size
+        Height and width.
+    """
+
+    def __init__(self, metric: VDM, statistics: Statistics, size: tuple[int, int]) -> None:
+        self.metric = metric
+        self.size = size
+        self.count = np.maximum(statistics.count, 1).reshape(size)
+        # Nothing is known of a pixel without a finite sample, and no sample will help.
+        seen = (statistics.count > 0).reshape(size)
+        self.single = pooled_covariance(statistics, size) * seen
+        self.mean = torch.from_numpy(statistics.mean.reshape(1, 3, *size))
+        self.true_means = metric.observer.true_means
+        self.exponent = metric.observer.summation_exponent
+        with torch.no_grad():
+            self.cortex = metric.represent(self.mean)
+        self.to_cones = _to_cones(metric)
+        self.variance = self._cone_variance(self.count)
+        self.details = detail_variances(self.variance, self.true_means)
+        self.truth = self.cortex._replace(
+            details=tuple(
+                _shrunk(detail, variance)
+                for detail, variance in zip(self.cortex.details, self.details, strict=True)
+            )
+        )
+
+    def totals(self, count: NDArray[np.float64] | None = None) -> Tensor:
+        """Return the total error of the finest nodes by the boundary images, (1, 1, h, w).
+
+        In JND to the power of the summation. With ``count``, (H, W), what it would be had each
+        pixel so many samples.
+        """
+        with torch.no_grad():
+            return self._totals(self.variance if count is None else self._cone_variance(count))
+
+    def shares(self) -> NDArray[np.float64]:
+        """Return how much each pixel's noise adds to the largest totals, (H, W), not negative.
+
+        Minus the derivative of a sum of the totals to the power of `SHARPNESS` by the logarithm
+        of each pixel's samples, in units of the whole.
+        """
+        logarithm = torch.zeros(self.size, dtype=torch.float64, requires_grad=True)
+        totals = self._totals(self.variance * torch.exp(-logarithm))
+        largest = totals.detach().amax().clamp_min(1e-300)
+        (gradient,) = torch.autograd.grad(((totals / largest) ** SHARPNESS).sum(), logarithm)
+        shares: NDArray[np.float64] = gradient.neg().clamp_min(0.0).numpy()
+        return shares / max(float(shares.sum()), 1e-300)
+
+    def _totals(self, variance: Tensor) -> Tensor:
+        lower, upper = boundaries(
+            self.truth,
+            detail_variances(variance, self.true_means),
+            variance.mean((-2, -1), keepdim=True) / variance[0, 0].numel(),
+            QUARTILE,
+            self.metric.observer.signed,
+        )
+        root = self.metric.lowpass_difference(lower, upper) ** self.exponent
+        first, *others = self.metric.local_differences(lower, upper) or (0.0,)
+        local = (first + root.sum(1, keepdim=True), *others)
+        return total(local, maximum(local))[-1]
+
+    @torch.no_grad()
+    def simulated(self, draws: int = DRAWS) -> NDArray[np.float64]:
+        """Return the largest difference in each of ``draws`` simulated pairs of images, JND.
+
+        The details of the truth are taken as the current ones, shrunk by the share of noise among
+        their neighbours; noise with the estimated covariance makes the image from them.
+        """
+        factor = _factor(torch.from_numpy(self.single / self.count))
+        generator = np.random.Generator(np.random.Philox(0))
+        height, width = self.size
+        step = max(1, AT_ONCE // (3 * height * width))
+        largest: list[Tensor] = []
+        for start in range(0, draws, step):
+            batch = min(step, draws - start)
+            normal = torch.from_numpy(generator.standard_normal((batch, 3, height, width)))
+            noise = torch.einsum("ijhw,bjhw->bihw", factor, normal)
+            noise = torch.einsum("ij,bjhw->bihw", self.to_cones, noise)
+            added = self.metric.transform.decompose(noise, true_means=self.true_means)
+            first = _batch(self.truth, batch)
+            second = Cortex(
+                tuple(a + b for a, b in zip(first.details, added.details, strict=True)),
+                tuple(a + b for a, b in zip(first.lowpass, added.lowpass, strict=True)),
+                first.mean + added.mean,
+            )
+            largest.append(self.metric.compare(first, second).amax((1, 2, 3)))
+        found: NDArray[np.float64] = torch.cat(largest).numpy() ** (1.0 / self.exponent)
+        return found
+
+    def predicted_maximum(self) -> float:
+        """Return the visible difference that the true one exceeds in few runs, JND."""
+        largest = self.simulated()
+        mean = float(largest.mean())
+        return mean + QUANTILE * math.hypot(float(largest.std(ddof=1)), INEXACT * mean)
+
+    def _cone_variance(self, count: NDArray[np.float64] | NDArray[np.int64]) -> Tensor:
+        """Return the variance of each pixel's mean in S, M, L, (1, 3, H, W)."""
+        # The diagonal of M C M^T.
+        matrix = self.to_cones.numpy()
+        weights = matrix[:, FIRST] * matrix[:, SECOND] * np.where(FIRST == SECOND, 1.0, 2.0)
+        variance = np.einsum("ck,khw->chw", weights, self.single) / count
+        return torch.from_numpy(np.maximum(variance, 0.0))[None]
+
+
+def _to_cones(metric: VDM) -> Tensor:
+    """Return the matrix from samples to S, M, L, (3, 3), float64."""
+    cones = metric.get_buffer("cones").double().cpu()
+    if metric.display.encoding == "xyz":
+        return cones
+    return cones @ metric.get_buffer("primaries").double().cpu() * metric.display.gain
+
+
+def _shrunk(detail: Tensor, variance: Tensor) -> Tensor:
+    """Return the details less the noise in them, d max(0, 1 - V / d^2), twice over.
+
+    With d^2 its mean over 3x3 nodes, which finds a texture; beside an edge that mean leaves the
+    noise as it is, so the detail by itself must pass too, and pass `DOUBT` variances.
+    """
+    power = detail * detail
+    share = torch.maximum(
+        _around(variance) / _around(power).clamp_min(NONE), DOUBT * variance / power.clamp_min(NONE)
+    )
+    return detail * (1.0 - share).clamp_min(0.0)
+
+
+def _around(plane: Tensor) -> Tensor:
+    """Return the mean over 3x3 nodes of (B, C, 3, h, w); fewer at the border."""
+    flat = plane.flatten(1, 2)
+    mean = functional.avg_pool2d(flat, 3, 1, 1, count_include_pad=False)
+    return mean.view(plane.shape)
+
+
+def _factor(covariance: Tensor) -> Tensor:
+    """Return the Cholesky factor of (6, H, W), as (3, 3, H, W); of a singular one too."""
+    rr, rg, rb, gg, gb, bb = covariance
+    a = rr.clamp_min(0.0).sqrt()
+    over_a = torch.where(a > 0.0, 1.0 / torch.where(a > 0.0, a, 1.0), 0.0)
+    b, c = rg * over_a, rb * over_a
+    d = (gg - b * b).clamp_min(0.0).sqrt()
+    # A remainder that is only rounding would be divided by.
+    over_d = torch.where(d * d > 1e-12 * gg, 1.0 / torch.where(d > 0.0, d, 1.0), 0.0)
+    e = (gb - b * c) * over_d
+    f = (bb - c * c - e * e).clamp_min(0.0).sqrt()
+    zero = torch.zeros_like(a)
+    return torch.stack(
+        (torch.stack((a, zero, zero)), torch.stack((b, d, zero)), torch.stack((c, e, f)))
+    )
+
+
+def _batch(cortex: Cortex, batch: int) -> Cortex:
+    """Return the representation repeated ``batch`` times."""
+    return Cortex(
+        tuple(d.expand(batch, *d.shape[1:]) for d in cortex.details),
+        tuple(p.expand(batch, *p.shape[1:]) for p in cortex.lowpass),
+        cortex.mean.expand(batch, *cortex.mean.shape[1:]),
+    )

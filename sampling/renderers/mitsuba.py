@@ -1,0 +1,477 @@
+"""Mitsuba as the renderer: single pixels of a scene, sample by sample.
+
+The only file that imports mitsuba. Each sample is a ray through a pixel, followed by the scene's
+own integrator; its random numbers come from the pixel, the number of the sample and the seed. The
+film, its filter and the scene's sampler are left out: pixels are boxes, and their samples are
+independent, as the statistics take them to be.
+"""
+
+import functools
+import hashlib
+import importlib
+import os
+import re
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sampling.renderers.llvm import OLDEST, PACKAGE, VARIABLE, find_llvm
+from sampling.renderers.protocol import Samples
+
+# In the order of preference; all compute in linear BT.709.
+VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
+
+# Samples in one call of the compiled variants. Speed is flat from 3e5 on, and 27 bytes are needed
+# for each. Status: choice, measured.
+BATCH = 2**20
+
+# What is asked of the `aov` integrator, in its own words, and how many numbers it gives.
+AOVS = "albedo:albedo,normal:sh_normal"
+AOV_NAMES = ("albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal.Z")
+
+
+class SceneError(ValueError):
+    """A scene that cannot be rendered; the message is one line."""
+
+
+class MitsubaRenderer:
+    """A scene of Mitsuba, sampled pixel by pixel; see `sampling.renderers.Renderer`.
+
+    Parameters
+    ----------
+    scene
+        The XML file.
+    parameters
+        Values for the scene's own parameters, ``<default name="..."/>``.
+    seed
+        0 to 2^32 - 1; other seeds give independent images.
+    aov
+        Whether albedo and shading normal are averaged in the same pass.
+    variant
+        One of `VARIANTS`, or "auto": a GPU where there is one, else compiled code where there is an
+        LLVM, else the interpreted variant, with a warning.
+    batch
+        Samples in one call of the compiled variants; changes memory and speed, and no bit.
+
+    Attributes
+    ----------
+    variant, version
+        The variant in use, and the version of Mitsuba.
+    size
+        Height and width of the image, in pixels: the film's crop.
+    fingerprint
+        A hash of the scene's file, of every file that it names, and of the parameters.
+    aov_sums
+        (7, H W), float64: sums of albedo R, G, B and normal X, Y, Z, and how many samples they
+        are of; None without ``aov``. A continued run begins with those of the run before.
+
+    Raises
+    ------
+    SceneError
+        If Mitsuba, the variant or something the scene names is missing, or if the scene cannot be
+        rendered.
+    LLVMError
+        If DRJIT_LIBLLVM_PATH names a library that cannot be used.
+    """
+
+    def __init__(
+        self,
+        scene: str | os.PathLike[str],
+        parameters: Mapping[str, str] | None = None,
+        *,
+        seed: int = 0,
+        aov: bool = False,
+        variant: str = "auto",
+        batch: int = BATCH,
+    ) -> None:
+        if not 0 <= seed < 2**32:
+            raise ValueError(f"expected a seed from 0 to {2**32 - 1}, got {seed}")
+        self.path = Path(scene)
+        if not self.path.is_file():
+            what = "a folder or a device" if self.path.exists() else "no such file"
+            raise SceneError(f"{self.path}: expected a scene of Mitsuba (XML), got {what}")
+        self._mi = load_mitsuba(variant)
+        self.variant: str = self._mi.variant()
+        self.version: str = self._mi.__version__
+        self.seed, self._batch = seed, batch
+        self.parameters = dict(parameters or {})
+        state = self._parse()
+        self._scene = self._instantiate(state)
+        self._sensor = self._scene.sensors()[0]
+        width, height = (int(side) for side in self._sensor.film().crop_size())
+        if width * height == 0:
+            raise SceneError(
+                f"{self.path}: expected a film of at least one pixel, got {width} x {height}"
+            )
+        if width * height >= 2**31:
+            raise SceneError(
+                f"{self.path}: expected fewer than 2^31 pixels, got {width} x {height}"
+            )
+        self.size = height, width
+        self._integrator = self._sampling_integrator()
+        self._named = _integrator_names(self._mi, state)
+        filters = _nodes(self._mi, state, "ReconstructionFilter")
+        self._filter = filters[0].plugin_name() if filters else "gaussian (Mitsuba's default)"
+        self._aov_at = 0
+        self.aov_sums: NDArray[np.float64] | None = None
+        if aov:
+            self._integrator = self._mi.load_dict(
+                {"type": "aov", "aovs": AOVS, "image": self._integrator}
+            )
+            self._aov_at = len(self._integrator.aov_names()) - len(AOV_NAMES)
+            self.aov_sums = np.zeros((len(AOV_NAMES) + 1, width * height))
+
+    def sample(
+        self, pixels: NDArray[np.int64], first: NDArray[np.int64], count: NDArray[np.int64]
+    ) -> Samples:
+        """Draw samples ``first[i]`` to ``first[i] + count[i] - 1`` of each of ``pixels``.
+
+        ``pixels`` is to be sorted: neighbours are traced together.
+        """
+        which = np.repeat(np.asarray(pixels, np.int64), count)
+        starts = np.cumsum(count) - count
+        number = np.arange(len(which)) - np.repeat(starts - first, count)
+        radiance = np.empty((len(which), 3), np.float32)
+        self._mi.set_variant(self.variant)  # someone else may have chosen another one
+        draw = self._draw_one_by_one if self.variant.startswith("scalar") else self._draw
+        for begin in range(0, len(which), self._batch):
+            part = slice(begin, begin + self._batch)
+            try:
+                radiance[part], aovs = draw(which[part], number[part])
+            except RuntimeError as error:
+                raise SceneError(f"{self.path}: {_one_line(error)}") from error
+            if self.aov_sums is not None:
+                for sums, plane in zip(self.aov_sums, [*aovs, None], strict=True):
+                    sums += np.bincount(which[part], plane, len(sums))
+        return Samples(which, radiance)
+
+    def _draw(
+        self, pixels: NDArray[np.int64], numbers: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
+        """Draw samples in one call of compiled code."""
+        mi, dr = self._mi, importlib.import_module("drjit")
+        drawn = len(pixels)
+        if drawn == 1:  # a width of one is compiled anew
+            pixels, numbers = pixels.repeat(2), numbers.repeat(2)
+        pixel = mi.UInt32(pixels.astype(np.uint32))
+        sampler = _pixel_sampler(self.variant)
+        sampler.start(pixel, mi.UInt32(numbers.astype(np.uint32)), dr.opaque(mi.UInt32, self.seed))
+        width = self.size[1]
+        radiance, aovs = self._follow(sampler, mi.Float(pixel % width), mi.Float(pixel // width))
+        dr.eval(radiance, aovs)
+        planes = [np.asarray(plane.numpy())[:drawn] for plane in aovs]
+        return np.asarray(radiance.numpy()).T[:drawn], planes
+
+    def _draw_one_by_one(
+        self, pixels: NDArray[np.int64], numbers: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
+        """Draw samples with the interpreted variant.
+
+        Not by rendering crops: the numbers that a pixel gets there depend on the crop and on how
+        many threads there are.
+        """
+        mi = self._mi
+        sampler = mi.load_dict({"type": "independent"})
+        width = self.size[1]
+        radiance = np.empty((len(pixels), 3), np.float32)
+        aovs = np.empty((len(pixels), len(AOV_NAMES) if self.aov_sums is not None else 0))
+        for i, (pixel, number) in enumerate(zip(pixels.tolist(), numbers.tolist(), strict=True)):
+            high, low = mi.sample_tea_32(pixel, self.seed)
+            sampler.seed(mi.sample_tea_32((high + number) % 2**32, low)[0], 1)
+            light, values = self._follow(sampler, float(pixel % width), float(pixel // width))
+            radiance[i] = light
+            aovs[i] = values
+        return radiance, list(aovs.T.astype(np.float32))
+
+    def _follow(self, sampler: Any, x: Any, y: Any) -> tuple[Any, list[Any]]:
+        """Return the light along a random ray through each pixel, and the pixel's AOVs."""
+        mi, sensor = self._mi, self._sensor
+        height, width = self.size
+        offset = sampler.next_2d()
+        position = mi.Point2f((x + offset.x) * (1.0 / width), (y + offset.y) * (1.0 / height))
+        lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+        time = mi.Float(sensor.shutter_open())
+        if sensor.shutter_open_time() > 0.0:
+            time += sampler.next_1d() * sensor.shutter_open_time()
+        # No wavelength is sampled: the variants are RGB.
+        ray, weight = sensor.sample_ray_differential(time, 0.5, position, lens)
+        light, _, aovs = self._integrator.sample(
+            self._scene, sampler, ray, sensor.get_medium(), True
+        )
+        wanted = aovs[self._aov_at :] if self.aov_sums is not None else []
+        return weight * light, wanted
+
+    def _parse(self) -> Any:
+        """Read the file and what it includes, and hash all of it."""
+        mi, parser = self._mi, self._mi.parser
+        for name in ("config", "filename"):
+            if name in self.parameters:
+                raise SceneError(
+                    f"{self.path}: Mitsuba cannot be given a parameter named {name!r}; "
+                    "call it otherwise in the scene"
+                )
+        config = parser.ParserConfig(self.variant)
+        try:
+            state = parser.parse_file(config, os.fspath(self.path), **self.parameters)
+            included = list(state.files)
+            parser.transform_all(config, state)
+        except RuntimeError as error:
+            raise SceneError(f"{self.path}: {_one_line(error)}") from error
+        if state.root.type != mi.ObjectType.Scene:
+            raise SceneError(f"{self.path}: expected a <scene> as the outermost element")
+        if not any(node.type == mi.ObjectType.Sensor for node in state.nodes):
+            raise SceneError(
+                f"{self.path}: expected a sensor, got none; add a <sensor> to the scene"
+            )
+        named = sorted(
+            {
+                str(value)
+                for node in state.nodes
+                for _, value in node.props.items()
+                if isinstance(value, str)
+            }
+        )
+        found = [self.path.parent / name for name in named if name]
+        digest = hashlib.sha256()
+        for name, value in sorted(self.parameters.items()):
+            digest.update(f"{name}={value}\n".encode())
+        for file in [Path(str(file)) for file in included] + [
+            file for file in found if _is_file(file)
+        ]:
+            with file.open("rb") as content:
+                digest.update(hashlib.file_digest(content, "sha256").digest())
+        self.fingerprint = digest.hexdigest()
+        return state
+
+    def _instantiate(self, state: Any) -> Any:
+        """Build the scene; files that it names are looked for in its own folder first."""
+        mi = self._mi
+        config = mi.parser.ParserConfig(self.variant)
+        resolver = mi.FileResolver(mi.file_resolver())
+        resolver.prepend(os.fspath(self.path.resolve().parent))
+        before = mi.file_resolver()
+        mi.set_file_resolver(resolver)
+        try:
+            return mi.parser.instantiate(config, state)
+        except RuntimeError as error:
+            raise SceneError(f"{self.path}: {_one_line(error)}") from error
+        finally:
+            mi.set_file_resolver(before)
+
+    def _sampling_integrator(self) -> Any:
+        """Return the scene's integrator, if light can be asked of it ray by ray."""
+        mi = self._mi
+        integrator = self._scene.integrator()
+        if integrator is None:
+            raise SceneError(
+                f'{self.path}: expected an integrator, got none; add <integrator type="path"/>'
+            )
+        # Those in Python are sampled in another way, and their base is not always loaded.
+        names = {kind.__name__ for kind in type(integrator).__mro__}
+        if not isinstance(integrator, mi.SamplingIntegrator) or "ADIntegrator" in names:
+            raise SceneError(
+                f"{self.path}: expected an integrator that samples single rays, such as path, "
+                f"volpath or direct, got {integrator.class_name()}"
+            )
+        return integrator
+
+    def aovs(self) -> dict[str, NDArray[np.float64]]:
+        """Return the mean albedo and shading normal so far, (H, W) each, by name of channel."""
+        if self.aov_sums is None:
+            return {}
+        *sums, count = self.aov_sums
+        return {
+            name: (plane / np.maximum(count, 1.0)).reshape(self.size)
+            for name, plane in zip(AOV_NAMES, sums, strict=True)
+        }
+
+    def plan(self) -> dict[str, Any]:
+        """Return what is simulated and why, for the JSON."""
+        return _plan(self._mi, self._scene, self._sensor, self._named, self._filter)
+
+
+def load_mitsuba(variant: str = "auto") -> Any:
+    """Import mitsuba with a variant that runs here, and return the module.
+
+    Raises
+    ------
+    SceneError
+        If mitsuba is not installed, or the variant that was asked for cannot run.
+    """
+    if variant not in ("auto", *VARIANTS):
+        raise SceneError(f"expected a variant among auto, {', '.join(VARIANTS)}, got {variant!r}")
+    llvm = find_llvm() is not None if variant in ("auto", "llvm_ad_rgb") else False
+    try:
+        mi = importlib.import_module("mitsuba")
+        dr = importlib.import_module("drjit")
+    except ImportError as error:
+        raise SceneError(
+            f"expected Mitsuba 3.9, got none ({error}); install it with: "
+            "pip install 'torch-vdm[render]'"
+        ) from error
+    llvm = llvm and bool(dr.has_backend(dr.JitBackend.LLVM))
+    if llvm and dr.detail.llvm_version()[0] < OLDEST:
+        # Whoever imported Mitsuba before let Dr.Jit choose for itself, once and for all.
+        raise SceneError(
+            f"expected LLVM {OLDEST} or newer, got {dr.detail.llvm_version()[0]}, which was loaded "
+            f"when mitsuba was imported; load the scene before that, or set {VARIABLE}"
+        )
+    usable = {
+        "cuda_ad_rgb": bool(dr.has_backend(dr.JitBackend.CUDA)),
+        "llvm_ad_rgb": llvm,
+        "scalar_rgb": True,
+    }
+    if variant == "auto":
+        variant = next(name for name in VARIANTS if usable[name])
+        if variant == "scalar_rgb":
+            warnings.warn(
+                "neither a GPU nor an LLVM of version 17 or newer was found: rendering with "
+                f"scalar_rgb, which is slow; install {PACKAGE}, or set {VARIABLE}",
+                stacklevel=2,
+            )
+    if not usable[variant]:
+        need = f"an LLVM; install {PACKAGE}, or set {VARIABLE}" if "llvm" in variant else "a GPU"
+        raise SceneError(f"{variant} needs {need}")
+    mi.set_variant(variant)
+    # Its warnings would break the live line; what matters is told here.
+    mi.set_log_level(mi.LogLevel.Error)
+    return mi
+
+
+@functools.cache
+def _sampler_class(variant: str) -> Any:
+    """Return the class of samplers whose numbers are a function of pixel, sample and seed."""
+    mi = importlib.import_module("mitsuba")
+    assert mi.variant() == variant
+
+    base: Any = mi.Sampler
+
+    class PixelSampler(base):  # type: ignore[misc]  # its base is known when Mitsuba is
+        """Random numbers of sample k of a pixel, whatever else is drawn along with it."""
+
+        def __init__(self) -> None:
+            super().__init__(mi.Properties("pixel"))
+            self.generator = mi.PCG32()
+
+        def start(self, pixel: Any, number: Any, seed: Any) -> None:
+            """Begin with the first number of each sample."""
+            high, low = mi.sample_tea_32(pixel, seed)
+            first, second = mi.sample_tea_32(high + number, low)
+            state = mi.UInt64(first) << 32 | mi.UInt64(second)
+            stream = mi.UInt64(high) << 32 | mi.UInt64(low)
+            # Not the constructor, which would add the lane's number to both.
+            self.generator.seed(state, stream)
+
+        def next_1d(self, active: Any = True) -> Any:
+            return self.generator.next_float32(active)
+
+        def next_2d(self, active: Any = True) -> Any:
+            first = self.generator.next_float32(active)
+            return mi.Point2f(first, self.generator.next_float32(active))
+
+    return PixelSampler
+
+
+def _pixel_sampler(variant: str) -> Any:
+    return _sampler_class(variant)()
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a string that is no name
+        return False
+
+
+def _one_line(error: Exception) -> str:
+    """Return an error of Mitsuba without the names of its source files, on one line."""
+    text = re.sub(r"\[[\w.]+\.(?:cpp|h):\d+\]\s*", "", str(error))
+    return re.sub(r"\s*\n\s*(?:- )?", " ", text).strip()
+
+
+def _nodes(mi: Any, state: Any, kind: str) -> list[Any]:
+    """Return the properties of the scene's elements of one kind."""
+    wanted = getattr(mi.ObjectType, kind)
+    return [node.props for node in state.nodes if node.type == wanted]
+
+
+def _integrator_names(mi: Any, state: Any) -> tuple[str, int | None]:
+    """Return what the scene says of its integrator: the plugin and its depth, None: no limit.
+
+    Of nested ones (aov, moment) the innermost.
+    """
+    found = _nodes(mi, state, "Integrator")
+    inner = [node for node in found if not list(node.references())] or found
+    depth = int(inner[-1].get("max_depth", -1))
+    return inner[-1].plugin_name(), depth if depth >= 0 else None
+
+
+def _plan(
+    mi: Any, scene: Any, sensor: Any, integrator: tuple[str, int | None], rfilter: str
+) -> dict[str, Any]:
+    """Return what is simulated and why."""
+    name, depth = integrator
+    shapes = scene.shapes()
+    flags = 0
+    for shape in shapes:
+        if shape.bsdf() is not None:
+            flags |= int(shape.bsdf().flags())
+    medium = sensor.get_medium() is not None or any(
+        shape.interior_medium() is not None or shape.exterior_medium() is not None
+        for shape in shapes
+    )
+    lights = name not in ("direct", "depth") and (depth is None or depth > 2)
+    bounces = "any number of" if depth is None else f"up to {depth}"
+    effects = [
+        (
+            "indirect light",
+            lights,
+            f"integrator {name}, {bounces} path segments"
+            if name != "direct"
+            else "integrator direct: light that is reflected once",
+        ),
+        (
+            "depth of field",
+            bool(sensor.needs_aperture_sample()),
+            "the sensor has a lens"
+            if sensor.needs_aperture_sample()
+            else "the sensor is a pinhole",
+        ),
+        (
+            "motion blur",
+            sensor.shutter_open_time() > 0.0,
+            f"the shutter is open for {float(sensor.shutter_open_time()):g} s",
+        ),
+        (
+            "media",
+            medium and name.startswith(("vol", "prbvol")),
+            f"the scene has {'one' if medium else 'none'}, and the integrator is {name}",
+        ),
+        (
+            "environment",
+            scene.environment() is not None,
+            f"the scene has {'one' if scene.environment() is not None else 'none'}",
+        ),
+    ]
+    for effect, mask in (
+        ("glossy reflection", mi.BSDFFlags.GlossyReflection),
+        ("mirror reflection", mi.BSDFFlags.DeltaReflection),
+        ("refraction", mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DeltaTransmission),
+    ):
+        present = bool(flags & int(mask))
+        effects.append((effect, present, f"{'some' if present else 'no'} material of the scene"))
+    return {
+        "integrator": name,
+        "max_depth": depth,
+        "sensor": f"the first of {len(scene.sensors())}",
+        "pixel_filter": "box",
+        "pixel_filter_why": f"samples of a pixel stay in it; the scene's film asks for {rfilter}",
+        "effects": [
+            {"effect": effect, "simulated": simulated, "why": why}
+            for effect, simulated, why in effects
+        ],
+    }

@@ -1,0 +1,387 @@
+"""The adaptive sampler: ask what to render, tell what came, in rounds (Fig. 8).
+
+It draws nothing itself and knows no renderer. `rounds` is the loop that joins the two.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sampling.prediction import Model
+from sampling.renderers import Renderer, Samples
+from sampling.statistics import FIRST, PIECE, SECOND, Statistics
+from sampling.strategies import LARGEST_GROWTH, SMALLEST_GROWTH, STRATEGIES, HalfBuffer
+from sampling.variance import pooled_covariance
+from torch_vdm import VDM, Haar
+from torch_vdm.quadtree import push
+
+Plane = NDArray[np.float64]
+
+StopReason = Literal["tolerance", "noise_threshold", "max_spp"]
+StrategyName = Literal["perceptual", "objective", "uniform", "halfbuffer"]
+
+# What `state` is made of. Raised when an older state would be continued differently.
+STATE_VERSION = 1
+
+# Share of the tolerance that a round aims at, for a prediction is not exact. Status: choice.
+AIM = 0.98
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What a user may choose.
+
+    Attributes
+    ----------
+    strategy
+        Where samples go.
+    tolerance
+        Largest visible difference, in JND, that may be left anywhere in the image.
+    max_spp
+        Most samples of any one pixel; None: no limit.
+    pilot
+        Samples of every pixel before the first decision.
+    noise_threshold
+        The half-buffer's own stop, in the unit of its error; None: stop on ``tolerance``.
+    unbiased
+        Decide on one set of samples and show another: when the run would stop, the same numbers
+        of samples are drawn anew, and only these make the image.
+
+    Raises
+    ------
+    ValueError
+        Where a number is out of its range.
+    """
+
+    strategy: StrategyName = "perceptual"
+    tolerance: float = 1.0
+    max_spp: int | None = None
+    pilot: int = 16
+    noise_threshold: float | None = None
+    unbiased: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be rendered."""
+        if self.strategy not in STRATEGIES:
+            raise ValueError(
+                f"expected a strategy of {', '.join(STRATEGIES)}, got {self.strategy!r}"
+            )
+        if not (math.isfinite(self.tolerance) and self.tolerance > 0.0):
+            raise ValueError(f"expected a tolerance over 0 JND, got {self.tolerance}")
+        if self.pilot < 2:
+            raise ValueError(f"expected at least 2 pilot samples, got {self.pilot}")
+        if self.max_spp is not None and self.max_spp < (2 if self.unbiased else 1):
+            raise ValueError(
+                f"expected at least 1 sample per pixel, 2 for an unbiased run, got {self.max_spp}"
+            )
+        if self.noise_threshold is not None:
+            if self.strategy != "halfbuffer":
+                raise ValueError("expected the halfbuffer strategy with a noise threshold")
+            if not (math.isfinite(self.noise_threshold) and self.noise_threshold > 0.0):
+                raise ValueError(f"expected a noise threshold over 0, got {self.noise_threshold}")
+
+
+@dataclass(frozen=True)
+class Request:
+    """Samples to draw: numbers ``first[i]`` to ``first[i] + count[i] - 1`` of ``pixels[i]``."""
+
+    pixels: NDArray[np.int64]
+    """(N,), sorted, each once."""
+    first: NDArray[np.int64]
+    """(N,)."""
+    count: NDArray[np.int64]
+    """(N,), at least 1."""
+
+    @property
+    def samples(self) -> int:
+        """How many samples that is."""
+        return int(self.count.sum())
+
+    def parts(self, at_once: int) -> Iterator["Request"]:
+        """Yield the request in parts of at most about ``at_once`` samples, in order.
+
+        A pixel's run is cut only at multiples of `PIECE`, as `Statistics` cuts it, so that the
+        size of a batch leaves no trace in the bits of the result. A part may thus be as large as
+        `PIECE`.
+        """
+        # Where each run is cut: at every multiple of PIECE inside it.
+        pieces = (self.first + self.count - 1) // PIECE - self.first // PIECE + 1
+        of = np.repeat(np.arange(len(self.pixels)), pieces)
+        place = np.arange(len(of)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        low = np.maximum(self.first[of], (self.first[of] // PIECE + place) * PIECE)
+        high = np.minimum(
+            (self.first + self.count)[of], (self.first[of] // PIECE + place + 1) * PIECE
+        )
+        ends = np.cumsum(high - low)
+        start = 0
+        while start < len(of):
+            drawn = ends[start - 1] if start else 0
+            stop = max(start + 1, int(np.searchsorted(ends, drawn + at_once, side="right")))
+            part = slice(start, stop)
+            # Pieces of one run that fall into one part are one run of it.
+            head = np.flatnonzero(np.diff(of[part], prepend=-1))
+            count = np.add.reduceat((high - low)[part], head)
+            yield Request(self.pixels[of[part][head]], low[part][head], count)
+            start = stop
+
+
+class Report(NamedTuple):
+    """What is known after a round."""
+
+    round: int
+    """Rounds done; the pilot is the first."""
+    samples: int
+    """Samples drawn so far."""
+    spp: float
+    """The same, a pixel."""
+    predicted: float
+    """Largest visible difference from the converged image, in JND: not exceeded with 95 %."""
+    over: float
+    """Share of pixels that are predicted over the tolerance, 0 to 1."""
+    jnd: NDArray[np.float64]
+    """(H, W), the predicted map, in JND; its maximum is ``predicted``."""
+    forecast: int
+    """Samples that the model expects to be still needed; 0 when stopped."""
+    nonfinite: int
+    """Samples that were NaN or infinite, and are not in the image."""
+    stop_reason: StopReason | None
+    """Why it stopped; None while it goes on."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether the promise holds: it stopped on its own criterion."""
+        return self.stop_reason in ("tolerance", "noise_threshold")
+
+
+class Sampler:
+    """Decides where samples go and when there are enough.
+
+    ``ask`` gives what to draw next, the same until all of it has been told, and None once it has
+    stopped. ``tell`` folds samples in. All decisions fall in ``ask``; they depend on the samples
+    and settings alone, not on batches.
+
+    Parameters
+    ----------
+    size
+        Height and width in pixels.
+    metric
+        Who judges; its display must be linear, or XYZ, and its transform `Haar`.
+    settings
+        What the user chose.
+
+    Raises
+    ------
+    ValueError
+        Where the size has a 0, or the metric's display is not linear, or its transform not `Haar`.
+    """
+
+    def __init__(
+        self, size: tuple[int, int], metric: VDM, settings: Settings | None = None
+    ) -> None:
+        if min(size) < 1:
+            raise ValueError(f"expected a height and width of at least 1, got {size}")
+        if metric.display.encoding == "srgb":
+            raise ValueError("expected a metric with a linear display, got sRGB-coded values")
+        if not isinstance(metric.transform, Haar):
+            raise ValueError(f"expected a metric on the Haar transform, got {metric.transform}")
+        self.size = (int(size[0]), int(size[1]))
+        self.metric = metric
+        self.settings = settings or Settings()
+        self._strategy = STRATEGIES[self.settings.strategy]
+        self._statistics = Statistics(self.size[0] * self.size[1], self._strategy.halves)
+        self._target = np.full(self.size[0] * self.size[1], self._pilot(), np.int64)
+        self._rounds = 0
+        # Of an unbiased run, once it has decided: why it stopped.
+        self._decided: StopReason | None = None
+        self._report: Report | None = None
+
+    def ask(self) -> Request | None:
+        """Return what is left to draw of this round, or the next round, or None when stopped."""
+        if self._report is not None and self._report.stop_reason is not None:
+            return None
+        left = self._left()
+        if not left.any():
+            self._decide()
+            left = self._left()
+            if not left.any():
+                return None
+        pixels, statistics = np.flatnonzero(left), self._statistics
+        return Request(pixels, (statistics.first + statistics.drawn)[pixels], left[pixels])
+
+    def tell(self, samples: Samples) -> None:
+        """Fold in samples: the parts of what was asked, in order."""
+        self._statistics.add(samples)
+
+    def report(self) -> Report | None:
+        """Return what the last decision saw; None before the pilot is complete."""
+        return self._report
+
+    @property
+    def image(self) -> Plane:
+        """(H, W, 3), the mean of the finite samples, linear BT.709; 0 where there are none."""
+        return self._statistics.mean.T.reshape(*self.size, 3).copy()
+
+    @property
+    def count(self) -> NDArray[np.int64]:
+        """(H, W), how many samples the image is made of."""
+        return self._statistics.count.reshape(self.size)
+
+    @property
+    def variance(self) -> Plane:
+        """(H, W, 3), the estimated variance of ``image``."""
+        single = pooled_covariance(self._statistics, self.size)[FIRST == SECOND]
+        variance: Plane = np.moveaxis(single, 0, -1) / np.maximum(self.count, 1)[..., None]
+        return variance
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that a continuation needs: arrays, numbers, strings, None, flat.
+
+        `restore` continues bit for bit, wherever in a round it was taken.
+        """
+        report = self._report._asdict() if self._report is not None else {}
+        return {
+            "version": STATE_VERSION,
+            "height": self.size[0],
+            "width": self.size[1],
+            "rounds": self._rounds,
+            "decided": self._decided,
+            "target": self._target.copy(),
+            **{f"settings.{name}": value for name, value in asdict(self.settings).items()},
+            **{f"statistics.{name}": a.copy() for name, a in self._statistics.state().items()},
+            **{f"report.{name}": value for name, value in report.items()},
+        }
+
+    @classmethod
+    def restore(cls, state: dict[str, Any], metric: VDM) -> Self:
+        """Return the sampler whose `state` this is; the metric must be as it was.
+
+        Raises
+        ------
+        ValueError
+            Where the state is of another version.
+        """
+        if state.get("version") != STATE_VERSION:
+            raise ValueError(
+                f"expected a state of version {STATE_VERSION}, got {state.get('version')}"
+            )
+        size = (int(state["height"]), int(state["width"]))
+        sampler = cls(size, metric, Settings(**_under("settings.", state)))
+        sampler._rounds = int(state["rounds"])
+        sampler._decided = state["decided"]
+        sampler._target = np.array(state["target"], np.int64)
+        sampler._statistics = Statistics.restored(_under("statistics.", state))
+        report = _under("report.", state)
+        sampler._report = Report(**report) if report else None
+        return sampler
+
+    def _left(self) -> NDArray[np.int64]:
+        return self._target - self._statistics.drawn
+
+    def _pilot(self) -> int:
+        return min(self.settings.pilot, self._most() or self.settings.pilot)
+
+    def _most(self) -> int | None:
+        """Return the most samples of a pixel before the run must stop; None: any number."""
+        most = self.settings.max_spp
+        return most // 2 if most is not None and self.settings.unbiased else most
+
+    def _decide(self) -> None:
+        """End a round: predict, then stop, or say how many samples every pixel is to have."""
+        statistics = self._statistics
+        model = Model(self.metric, statistics, self.size)
+        predicted = model.predicted_maximum()
+        totals = model.totals()
+        largest = float(totals.max()) ** (1.0 / model.exponent)
+        # The boundary images say where, the simulation how much.
+        scale = predicted / largest if largest > 0.0 else 1.0
+        jnd = push(totals, self.size)[0, 0].numpy() ** (1.0 / model.exponent) * scale
+        drawn = int((statistics.first + statistics.drawn).sum())
+        forecast, reason = 0, self._decided
+        if reason is None:
+            reason = self._enough(predicted)
+        if reason is None:
+            wanted = self._wanted(model, scale)
+            target = np.ceil(wanted).astype(np.int64).reshape(-1) + statistics.nonfinite
+            target = np.maximum(target, statistics.drawn)
+            forecast = int((target - statistics.drawn).sum())
+            most = self._most()
+            if most is not None:
+                target = np.maximum(np.minimum(target, most), statistics.drawn)
+            if (target > statistics.drawn).any():
+                self._target = target
+            else:
+                reason, forecast = "max_spp", 0
+        if self.settings.unbiased:
+            shown = self._decided is not None
+            if reason is not None and not shown:
+                # The same numbers of samples once more, on which nothing has been decided.
+                self._decided, reason = reason, None
+                self._target = statistics.drawn.copy()
+                self._statistics = Statistics(
+                    len(self._target), self._strategy.halves, first=statistics.drawn
+                )
+            if not shown:
+                forecast = 2 * forecast + int(self._target.sum())
+        self._rounds += 1
+        self._report = Report(
+            round=self._rounds,
+            samples=drawn,
+            spp=drawn / len(self._target),
+            predicted=predicted,
+            over=float((jnd > self.settings.tolerance).mean()),
+            jnd=jnd,
+            forecast=forecast,
+            nonfinite=int(statistics.nonfinite.sum()),
+            stop_reason=reason,
+        )
+
+    def _enough(self, predicted: float) -> StopReason | None:
+        """Return why the samples are enough, None where they are not."""
+        threshold = self.settings.noise_threshold
+        if threshold is None:
+            return "tolerance" if predicted <= self.settings.tolerance else None
+        noise = HalfBuffer().noise(self._statistics, self.size)
+        return "noise_threshold" if noise.max() <= threshold else None
+
+    def _wanted(self, model: Model, scale: float) -> Plane:
+        """Return how many finite samples every pixel is to have, (H, W)."""
+        threshold = self.settings.noise_threshold
+        if threshold is not None:
+            noise = HalfBuffer().noise(self._statistics, self.size)
+            growth = np.clip((noise / threshold) ** 2, SMALLEST_GROWTH, LARGEST_GROWTH)
+            alone: Plane = model.count * np.where(noise > threshold, growth, 1.0)
+            return alone
+        goal = (AIM * self.settings.tolerance / scale) ** model.exponent
+        wanted = self._strategy.wanted(model, self._statistics, goal)
+        if not (wanted > model.count).any():
+            # The boundary images see nothing where the simulation does.
+            wanted = 2.0 * model.count
+        return wanted
+
+
+def rounds(sampler: Sampler, renderer: Renderer, at_once: int = 2**20) -> Iterator[Report]:
+    """Render until the sampler stops; yield its report after each round.
+
+    ``at_once``: samples asked of the renderer in one call. It changes memory and speed, no bit of
+    the result.
+    """
+    seen: Report | None = None
+    while True:
+        request = sampler.ask()
+        report = sampler.report()
+        if report is not None and report is not seen:
+            yield report
+            seen = report
+        if request is None:
+            return
+        for part in request.parts(at_once):
+            sampler.tell(renderer.sample(part.pixels, part.first, part.count))
+
+
+def _under(prefix: str, state: dict[str, Any]) -> dict[str, Any]:
+    """Return the entries whose names begin with a prefix, without it."""
+    return {name.removeprefix(prefix): v for name, v in state.items() if name.startswith(prefix)}

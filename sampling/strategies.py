@@ -1,0 +1,161 @@
+"""Where the next samples go ("determine next sample location", Fig. 8).
+
+Four strategies under one contract. Each says how many samples every pixel should have by the end
+of the next round, so that the model itself predicts the tolerance; none decides when to stop.
+"""
+
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn import functional
+
+from sampling.prediction import Model
+from sampling.statistics import Statistics
+
+Plane = NDArray[np.float64]
+
+# A round multiplies no pixel's samples by more. Status: choice.
+LARGEST_GROWTH = 64.0
+
+# A round multiplies the samples of a pixel that it selects by no less. Status: choice.
+SMALLEST_GROWTH = 1.05
+
+# Halvings of the logarithm of the growth: 1.5 % of the largest. Status: choice.
+STEPS = 8
+
+
+class Strategy(Protocol):
+    """Distributes the samples of a round."""
+
+    @property
+    def halves(self) -> bool:
+        """Whether it needs the mean of every second sample."""
+
+    def wanted(self, model: Model, statistics: Statistics, goal: float) -> Plane:
+        """Return how many samples every pixel should have, (H, W), at least what it has.
+
+        Parameters
+        ----------
+        model
+            Of the samples so far.
+        statistics
+            The samples so far.
+        goal
+            The largest total error of the boundary images that is wanted, in JND to the power of
+            the summation.
+        """
+
+
+class Perceptual:
+    """The paper's: more samples below the nodes whose total is over the tolerance.
+
+    A total over the tolerance is the sum of errors down a path, of neighbours too by pooling, so
+    that it is traced back to the pixels whose noise it is made of. Where every pixel's samples are
+    in proportion to its share, no other distribution of as many does better; a round goes there
+    half way in the logarithm, for the shares of what it improves will fall.
+    """
+
+    halves = False
+
+    def wanted(self, model: Model, statistics: Statistics, goal: float) -> Plane:
+        """Find the smallest growth along the shares at which the model predicts the goal."""
+        del statistics
+        worth = np.sqrt(model.shares() / model.count)
+        worth /= max(float(worth.max()), 1e-300)
+        low, high = 0.0, float(np.log(LARGEST_GROWTH))
+        for _ in range(STEPS):
+            middle = 0.5 * (low + high)
+            enough = float(model.totals(_grown(model, worth, middle)).max()) <= goal
+            low, high = (low, middle) if enough else (middle, high)
+        return _grown(model, worth, max(high, float(np.log(SMALLEST_GROWTH))))
+
+
+class _Levelled:
+    """Evens out an error that falls as one over the samples, down to one level for all pixels."""
+
+    halves = False
+
+    def error(self, model: Model, statistics: Statistics) -> Plane:
+        """Return the error of every pixel, (H, W), not negative."""
+        raise NotImplementedError
+
+    def wanted(self, model: Model, statistics: Statistics, goal: float) -> Plane:
+        """Find the highest level of error at which the model predicts the goal."""
+        growth = self.error(model, statistics)
+        growth = growth / max(float(growth.max()), 1e-300)
+        low, high = 0.0, float(np.log(LARGEST_GROWTH))
+        for _ in range(STEPS):
+            middle = 0.5 * (low + high)
+            count = model.count * np.maximum(growth * np.exp(middle), 1.0)
+            enough = float(model.totals(count).max()) <= goal
+            low, high = (low, middle) if enough else (middle, high)
+        level = max(high, float(np.log(SMALLEST_GROWTH)))
+        grown: Plane = model.count * np.maximum(growth * np.exp(level), 1.0)
+        return grown
+
+
+class Uniform(_Levelled):
+    """The same number of samples for every pixel."""
+
+    def error(self, model: Model, statistics: Statistics) -> Plane:
+        """Return one over the samples."""
+        del statistics
+        return 1.0 / model.count
+
+
+class Objective(_Levelled):
+    """The paper's Eq. 6: the variance of the mean, summed over R, G, B.
+
+    Its detail coefficients have a quarter of their pixels' variance whatever the orientation, so
+    that the largest local error lies where the variance is largest.
+    """
+
+    def error(self, model: Model, statistics: Statistics) -> Plane:
+        """Return s^2 / n, with the shrunk variance: seen by itself, none is 0 for ever."""
+        del statistics
+        error: Plane = (model.single[0] + model.single[3] + model.single[5]) / model.count
+        return error
+
+
+class HalfBuffer(_Levelled):
+    """What Cycles and OpenMoonRay do: the image beside the image of every second sample.
+
+    sum abs(I - I_half) / sqrt(sum I), the largest within 3x3 pixels; squared it falls as one over
+    the samples.
+    """
+
+    halves = True
+
+    def noise(self, statistics: Statistics, size: tuple[int, int]) -> Plane:
+        """Return the error of every pixel in its own unit, (H, W)."""
+        if statistics.half_mean is None:
+            raise ValueError("expected statistics with halves")
+        distance = np.abs(statistics.mean - statistics.half_mean).sum(0)
+        light = np.maximum(statistics.mean.sum(0), 0.0)
+        error = distance / np.sqrt(np.maximum(light, DARKEST))
+        plane = torch.from_numpy(error.reshape(1, 1, *size))
+        found: Plane = functional.max_pool2d(plane, 3, 1, 1)[0, 0].numpy()
+        return found
+
+    def error(self, model: Model, statistics: Statistics) -> Plane:
+        """Return the square of the noise."""
+        return self.noise(statistics, model.size) ** 2
+
+
+# The half-buffer divides by no less light than this. Status: choice; Cycles' own.
+DARKEST = 1e-4
+
+STRATEGIES: dict[str, Strategy] = {
+    "perceptual": Perceptual(),
+    "objective": Objective(),
+    "uniform": Uniform(),
+    "halfbuffer": HalfBuffer(),
+}
+
+
+def _grown(model: Model, worth: Plane, growth: float) -> Plane:
+    """Return the samples of every pixel, (H, W), where the worthiest grow by exp(growth)."""
+    count: Plane = model.count * np.maximum(worth * np.exp(growth), 1.0)
+    return count

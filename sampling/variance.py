@@ -1,0 +1,115 @@
+"""The variance of every pixel, shrunk towards its neighbourhood's: no variance seen is not none.
+
+Where a pixel's first samples all miss a small light, their variance is 0. What its neighbours saw
+is then the better estimate. Every node of the quad-tree has a pooled variance; from the root down,
+each is mixed with its parent's (empirical Bayes), by how much each of them knows.
+"""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn import functional
+
+from sampling.statistics import FIRST, SECOND, Statistics, scalar_second
+
+Plane = NDArray[np.float64]
+
+# The least that the parent's variance is worth, in degrees of freedom of the node's own. A
+# variance from n samples with a kurtosis of k has 2 n / (k - 1): n for normal noise, and twice
+# the number of events where noise is rare events. Status: choice, measured.
+PRIOR = 4.0
+
+# Most that it is ever worth. Status: choice.
+LARGEST_PRIOR = 1000.0
+
+# A relative distance between variances, squared, counts for no more. Status: choice; rare events
+# would otherwise speak for all their neighbours.
+FARTHEST = 4.0
+
+# Kurtosis of normal noise, where none has been seen.
+NORMAL = 3.0
+
+
+def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
+    """Return the covariance of a single sample of every pixel, shrunk, (6, H, W).
+
+    ``size`` is height and width; the order is that of `Statistics.comoments`.
+    """
+    counts = statistics.count.astype(np.float64)
+    sums = np.concatenate(
+        (
+            statistics.comoments,
+            statistics.higher[1:],
+            statistics.mean * counts,
+            np.maximum(counts - 1.0, 0.0)[None],
+            counts[None],
+        )
+    ).reshape(12, *size)
+    levels = [sums]
+    while max(levels[-1].shape[1:]) > 1:
+        levels.append(_four(levels[-1]))
+    estimate, mean = _own(levels.pop())
+    while levels:
+        nodes = levels.pop()
+        own, own_mean = _own(nodes)
+        parent, parent_mean = _push(estimate, nodes.shape[1:]), _push(mean, nodes.shape[1:])
+        second, fourth = scalar_second(parent[:6]), parent[6]
+        kurtosis = _ratio(fourth, second * second, NORMAL)
+        freedom = 2.0 * nodes[11] / np.maximum(kurtosis - 1.0, 1e-3)
+        # The mean, which scales what the parent knows, is shrunk by the least weight.
+        weight = PRIOR / (PRIOR + freedom)
+        mean = weight * parent_mean + (1.0 - weight) * own_mean
+        scale = _ratio(np.abs(mean), np.abs(parent_mean), 1.0)
+        scalar = scale.mean(0)
+        prior = parent * np.concatenate((scale[FIRST] * scale[SECOND], scalar[None] ** 4))
+        worth = _worth(scalar_second(own[:6]), scalar_second(prior[:6]), freedom)
+        weight = worth / (worth + freedom)
+        estimate = weight * prior + (1.0 - weight) * own
+    return estimate[:6]
+
+
+def _worth(own: Plane, prior: Plane, freedom: Plane) -> Plane:
+    """Return what the prior is worth, in degrees of freedom, at every node.
+
+    How far the nodes' own variances lie from the prior, beyond what their few samples explain,
+    is how far the truth does: 2 over its square. Averaged over neighbours.
+    """
+    apart = _ratio(own, prior, 1.0) - 1.0
+    chance = 2.0 / np.maximum(freedom, 1e-3)
+    spread = _smooth(np.minimum(apart * apart, FARTHEST)) - _smooth(np.minimum(chance, FARTHEST))
+    return np.clip(2.0 / np.maximum(spread, 1e-9), PRIOR, LARGEST_PRIOR)
+
+
+def _smooth(plane: Plane) -> Plane:
+    """Return the mean over 5x5 nodes, fewer at the border."""
+    tensor = torch.from_numpy(plane)[None, None]
+    return functional.avg_pool2d(tensor, 5, 1, 2, count_include_pad=False)[0, 0].numpy()
+
+
+def _own(sums: Plane) -> tuple[Plane, Plane]:
+    """Return covariance and fourth moment of the samples of each node, and its mean.
+
+    About the means of the pixels, not of the node: a texture is no noise.
+    """
+    count = np.maximum(sums[11], 1.0)
+    covariance = sums[:6] / np.maximum(sums[10], 1.0)
+    return np.concatenate((covariance, sums[6:7] / count)), sums[7:10] / count
+
+
+def _ratio(over: Plane, under: Plane, otherwise: float) -> Plane:
+    """Return a quotient, ``otherwise`` where its divisor is 0."""
+    return np.where(under > 0.0, over / np.where(under > 0.0, under, 1.0), otherwise)
+
+
+def _four(plane: Plane) -> Plane:
+    """Return the sums of 2x2 nodes; an odd side ends in nodes of fewer."""
+    height, width = plane.shape[1:]
+    even = np.pad(plane, ((0, 0), (0, height % 2), (0, width % 2)))
+    rows = even[:, 0::2] + even[:, 1::2]
+    total: Plane = rows[..., 0::2] + rows[..., 1::2]
+    return total
+
+
+def _push(plane: Plane, size: tuple[int, ...]) -> Plane:
+    """Give every child on a plane of ``size`` the value of its parent."""
+    return plane.repeat(2, 1).repeat(2, 2)[:, : size[0], : size[1]]

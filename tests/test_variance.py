@@ -1,0 +1,105 @@
+"""The shrunk variance against known ones, where samples have seen nothing and where they have."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sampling.renderers import Samples
+from sampling.renderers.synthetic import Synthetic
+from sampling.statistics import FIRST, SECOND, Statistics
+from sampling.variance import pooled_covariance
+
+
+def drawn(renderer: Synthetic, count: int) -> Statistics:
+    height, width = renderer.size
+    pixels = np.arange(height * width)
+    statistics = Statistics(len(pixels))
+    statistics.add(renderer.sample(pixels, 0 * pixels, np.full(len(pixels), count)))
+    return statistics
+
+
+def wall(chance: float, event: float = 0.1, seed: int = 0) -> Synthetic:
+    base = np.full((16, 16, 3), 0.3)
+    return Synthetic(base, np.full((16, 16, 3), event), np.full((16, 16), chance), seed)
+
+
+def green(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    own: NDArray[np.float64] = covariance[3]
+    return own
+
+
+@pytest.mark.parametrize(("chance", "count"), [(0.01, 16), (0.001, 64)])
+def test_no_variance_seen_is_not_no_variance(chance: float, count: int) -> None:
+    renderer = wall(chance)
+    statistics = drawn(renderer, count)
+    own = statistics.covariance()[3]
+    assert (own == 0.0).mean() > 0.7  # most pixels have seen nothing
+    shrunk = green(pooled_covariance(statistics, renderer.size))
+    truth = renderer.covariance[0, 0, 1, 1]
+    assert shrunk.min() > 0.1 * truth
+    # The mean of 256 pixels with chance x count events each: a z-test, significance 6e-5.
+    events = 256 * chance * count
+    assert abs(shrunk.mean() / truth - 1.0) < 4.0 / np.sqrt(events) + 0.1
+
+
+def test_many_samples_speak_for_themselves() -> None:
+    rng = np.random.default_rng(3)
+    event = rng.uniform(0.02, 0.3, (16, 16, 1)) * np.ones(3)
+    renderer = Synthetic(np.full((16, 16, 3), 0.3), event, np.full((16, 16), 0.5))
+    shrunk = pooled_covariance(drawn(renderer, 16000), renderer.size)
+    truth = renderer.covariance[..., FIRST, SECOND].transpose(2, 0, 1)
+    np.testing.assert_allclose(shrunk, truth, rtol=0.03)
+
+
+def test_a_pixel_without_noise_beside_noise_is_soon_believed() -> None:
+    event = np.zeros((16, 16, 3))
+    event[:, 8:] = 0.1
+    renderer = Synthetic(np.full((16, 16, 3), 0.3), event, np.full((16, 16), 0.3))
+    truth = renderer.covariance[0, 8, 1, 1]
+    quiet = [
+        green(pooled_covariance(drawn(renderer, count), renderer.size))[:, :8].max() / truth
+        for count in (16, 256, 4096)
+    ]
+    assert quiet[0] < 0.7
+    assert quiet[1] < 0.1
+    assert quiet[2] < 0.01
+
+
+def test_a_dark_pixel_beside_a_bright_one_keeps_its_scale() -> None:
+    base = np.full((16, 16, 3), 0.001)
+    base[:, 8:] = 1.0
+    renderer = Synthetic(base, base, np.full((16, 16), 0.3))
+    shrunk = green(pooled_covariance(drawn(renderer, 1024), renderer.size))
+    truth = renderer.covariance[..., 1, 1]
+    # Without scaling by the mean it would be 4 / 1028 of the bright one's, 4000 times the truth.
+    assert (shrunk[:, :8] / truth[:, :8]).max() < 10.0
+
+
+def test_it_scales_with_the_radiance() -> None:
+    samples = wall(0.1).sample(np.arange(256), np.zeros(256, np.int64), np.full(256, 16))
+    found = []
+    for factor in (1.0, 8.0):  # a power of two: exact
+        statistics = Statistics(256)
+        scaled = samples.radiance * np.float32(factor)
+        statistics.add(Samples(samples.pixels, scaled))
+        found.append(pooled_covariance(statistics, (16, 16)))
+    np.testing.assert_allclose(found[1], 64.0 * found[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (3, 7)])
+def test_any_size_and_no_noise(size: tuple[int, int]) -> None:
+    renderer = Synthetic(np.full((*size, 3), 0.2), np.zeros((*size, 3)), np.ones(size))
+    shrunk = pooled_covariance(drawn(renderer, 4), size)
+    np.testing.assert_array_equal(shrunk, np.zeros((6, *size)))
+
+
+def test_it_is_a_covariance() -> None:
+    rng = np.random.default_rng(5)
+    samples = Samples(np.repeat(np.arange(64), 4), rng.random((256, 3)).astype(np.float32))
+    statistics = Statistics(64)
+    statistics.add(samples)
+    shrunk = pooled_covariance(statistics, (8, 8))
+    matrices = np.empty((64, 3, 3))
+    for row, (one, other) in enumerate(zip(FIRST, SECOND, strict=True)):
+        matrices[:, one, other] = matrices[:, other, one] = shrunk[row].reshape(-1)
+    assert np.linalg.eigvalsh(matrices).min() > 0.0
