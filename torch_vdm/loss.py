@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from torch_vdm.display import Display
-from torch_vdm.pair import finite_in_both
 from torch_vdm.observer import Observer
+from torch_vdm.pair import finite_in_both
 from torch_vdm.vdm import VDM
 
 Reduction = Literal["mean", "sum", "none"]
@@ -21,8 +21,8 @@ L1 = 240.0
 
 
 # The dark light of the loss's observer, cd/m2: of a screen in a lit room, a hundred times the eye's
-# own. A step away from black is then not seen at a contrast of hundreds, and 300 steps of Adam lead
-# from black to the picture by the metric alone; with 0.02 they do not. Status: choice, by experiment.
+# own. A step away from black is then not seen at a contrast of hundreds: 300 steps of Adam lead
+# from black to the picture by the metric alone; with 0.02 they do not. Status: choice, measured.
 DARK_LIGHT = 0.2
 
 
