@@ -110,13 +110,15 @@ def pattern(threshold: Threshold, ppd: float, phase: float) -> Tensor:
     x = (torch.arange(side, dtype=torch.float64) - side / 2) / ppd - 0.31 / threshold.scale
     y = x.unsqueeze(1)
     if threshold.stimulus == "disk":
-        return (x * x + y * y < half * half).double()
+        disc: Tensor = x * x + y * y < half * half
+        return disc.double()
     if threshold.sigma is not None:
         envelope = torch.exp(-(x * x + y * y) / (2.0 * threshold.sigma**2))
     else:
         envelope = ((x.abs() <= half) & (y.abs() <= half)).double()
     across = x if threshold.orientation == 0.0 else y
-    return envelope * torch.cos(2.0 * math.pi * threshold.frequency * across + phase)
+    drawn: Tensor = envelope * torch.cos(2.0 * math.pi * threshold.frequency * across + phase)
+    return drawn
 
 
 def background(luminance: float) -> Tensor:

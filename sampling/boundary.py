@@ -83,18 +83,22 @@ def _axis(side: int, node: int, count: int, true_means: bool) -> _Axis:
     low = torch.full((2, parents), 0.25, dtype=torch.float64)
     high, own = low.clone(), low.clone()
     share = (side % node or node) / node
+
+    def squares(first: float, second: float) -> Tensor:
+        return torch.tensor([first**2, second**2], dtype=torch.float64)
+
+    # The pixels that the last node lacks are like the node before it; without a sibling its window
+    # reaches back over that one, or it stands beside itself.
+    half = 0.5 * share
     if count % 2 == 1:
-        # The last node has no sibling: its window reaches back over its neighbour, or it stands
-        # beside itself.
-        step = share / (1.0 + share) if true_means and count > 1 else 0.0
         nodes[:, -1] = torch.tensor([count - 1, max(count - 2, 0)])
-        low[:, -1] = torch.tensor([(1.0 - step) ** 2, step**2], dtype=torch.float64)
-        high[:, -1] = step**2
-        own[:, -1] = torch.tensor([1.0, 0.0])
+        own[:, -1] = squares(1.0, 0.0)
+        reaches = true_means and count > 1
+        low[:, -1] = squares(half, 1.0 - half) if reaches else squares(1.0, 0.0)
+        high[:, -1] = squares(half, half) if reaches else 0.0
     elif true_means:
-        step = share / (1.0 + share)
-        low[:, -1] = own[:, -1] = torch.tensor([(1.0 - step) ** 2, step**2], dtype=torch.float64)
-        high[:, -1] = step**2
+        low[:, -1], high[:, -1] = squares(1.0 - half, half), squares(half, half)
+        own[:, -1] = squares(1.0, share) / (1.0 + share) ** 2
     return _Axis(nodes, low, high, own)
 
 

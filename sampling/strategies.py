@@ -83,7 +83,8 @@ class _Levelled:
 
     def wanted(self, model: Model, statistics: Statistics, goal: float) -> Plane:
         """Find the highest level of error at which the model predicts the goal."""
-        growth = self.error(model, statistics)
+        # A pixel without a finite sample is taken as known: it must not set the level.
+        growth = self.error(model, statistics) * (statistics.count > 0).reshape(model.size)
         growth = growth / max(float(growth.max()), 1e-300)
         low, high = 0.0, float(np.log(LARGEST_GROWTH))
         for _ in range(STEPS):

@@ -5,11 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import settings
 from numpy.typing import NDArray
 
 settings.register_profile("default", deadline=None, derandomize=True, max_examples=40)
 settings.load_profile("default")
+
+# The images of tests are small: threads would wait for each other longer than they compute.
+torch.set_num_threads(1)
 
 ROOT = Path(__file__).resolve().parent.parent
 

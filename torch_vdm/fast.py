@@ -5,8 +5,6 @@ from functools import cache
 from typing import Any
 
 import torch
-from torch._dynamo import config as _dynamo_config
-from torch.fx.experimental import _config
 
 # Planes with fewer numbers stay uncompiled: a compiled call costs more than they do.
 # Status: choice.
@@ -23,6 +21,10 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     It serves every height and width. A batch of one is compiled apart from larger ones, so give
     it one item at a time, and tensors that are no views, for it is specialised on offsets too.
     """
+    # Imported where it is used: it takes longer than the rest of the package.
+    from torch._dynamo import config as _dynamo_config
+    from torch.fx.experimental import _config
+
     specialised = torch.compile(function, dynamic=True, fullgraph=True)
 
     def call(*arguments: object) -> Any:

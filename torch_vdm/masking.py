@@ -22,26 +22,21 @@ def energy_transducer(energy: Tensor) -> Tensor:
     return GAIN * numerator / (energy * torch.exp2((DENOMINATOR - 1.0) * octaves) + 1.0)
 
 
-def signed_transducer(
-    contrast: Tensor, exponent: Tensor, start: Tensor, knee: Tensor, phases: int = 1
-) -> Tensor:
-    """Return c v (s + v^2) / (k + v^2)^(1 + q) for a weighted contrast v, psi(1) = 1.
+def signed_transducer(contrast: Tensor, exponent: Tensor, phases: int = 1) -> Tensor:
+    """Return 2^q v / (1 + v^2)^q for a weighted contrast v (1 at threshold), psi(1) = 1.
 
-    ``contrast`` is (B, channels, orientations, h, w), 1 at threshold; q is ``exponent``, s is
-    ``start``, k is ``knee``. Of ``phases`` successive orientations, the even and odd ones of a
-    pair, v^2 is the energy of all: what they mask has no phase.
+    ``contrast`` is (B, channels, orientations, h, w). Of ``phases`` successive orientations, the
+    even and odd ones of a pair, v^2 is the energy of all: what they mask has no phase.
 
-    Odd, so that a detail differs from its negative. It rises as v, then v^3, then v^(1 - 2q): a
-    weak pedestal makes a contrast easier to see, a strong one harder (Legge and Foley 1980). Its
-    slope at 0 is not 0, so that a loss moves from grey or black.
+    Odd, so that a detail differs from its negative; its slope at 0 is 2^q, so that a loss moves
+    from grey or black; far out it grows as v^(1 - 2q), so that with q = 0.3 a strong contrast hides
+    increments in proportion to its power 0.6 (Legge and Foley 1980). Status: choice.
     """
+    # Base 2 because a processor's own exponential is: (1 + v^2)^-q = 2^(-q log2(1 + v^2)).
     energy = contrast * contrast
-    if phases > 1:
-        energy = energy.unflatten(2, (-1, phases)).sum(3, keepdim=True)
-        contrast = contrast.unflatten(2, (-1, phases))
-    # Base 2 because a processor's own exponential is. The quotient is bounded where v^3 is not.
-    above = energy + knee
-    falling = torch.exp2(exponent * (torch.log2(knee + 1.0) - torch.log2(above)))
-    gain = (energy + start) / above * falling * ((knee + 1.0) / (start + 1.0))
-    response: Tensor = contrast * gain
-    return response.flatten(2, 3) if phases > 1 else response
+    if phases == 1:
+        return contrast * torch.exp2(exponent * (1.0 - torch.log2(energy + 1.0)))
+    energy = energy.unflatten(2, (-1, phases)).sum(3, keepdim=True)
+    gain = torch.exp2(exponent * (1.0 - torch.log2(energy + 1.0)))
+    response: Tensor = (contrast.unflatten(2, (-1, phases)) * gain).flatten(2, 3)
+    return response

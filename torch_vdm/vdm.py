@@ -45,9 +45,6 @@ LARGEST_AT_ONCE = 2**20
 # A Butterworth filter's parameters.
 FILTER = ("gain", "cutoff", "order")
 
-# q, s and k of the signed transducer.
-Transducer = tuple[Tensor, Tensor, Tensor]
-
 
 class Level(NamedTuple):
     """What a level of the transform responds to, as far as it does not depend on the image.
@@ -229,7 +226,7 @@ class VDM(PairMetric):
                 detail,
                 *self._sight(cortex, number, level, constants),
                 constants["opponents"],
-                self._transducer(constants),
+                constants["transducer_exponent"],
                 self.observer.signed,
                 self.effects.masking,
                 self.transform.phases,
@@ -305,7 +302,7 @@ class VDM(PairMetric):
                 other_scale,
                 other_sensitivity[:, :, same],
                 constants["opponents"],
-                self._transducer(constants),
+                constants["transducer_exponent"],
                 self.observer.signed,
                 self.effects.masking,
                 self.transform.phases,
@@ -378,12 +375,6 @@ class VDM(PairMetric):
         columns = [[row.clone() for row in part] for part in (passed, frequency, gain, bright)]
         return [Level(*row) for row in zip(*columns, strict=True)]
 
-    def _transducer(self, constants: dict[str, Tensor]) -> Transducer:
-        exponent, start, knee = (
-            constants[f"transducer_{part}"] for part in ("exponent", "start", "knee")
-        )
-        return exponent, start, knee
-
 
 def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) -> Tensor:
     """Return the cone responses (B, 3, H, W) to an image on a display."""
@@ -395,7 +386,7 @@ def _response(
     scale: Tensor,
     sensitivity: Tensor,
     matrix: Tensor,
-    transducer: Transducer,
+    exponent: Tensor,
     signed: bool,
     masking: bool,
     phases: int,
@@ -404,7 +395,7 @@ def _response(
     contrast = opponents(local_contrast(details, scale), matrix)
     weighted = contrast * sensitivity
     if signed:
-        return signed_transducer(weighted, *transducer, phases) if masking else weighted
+        return signed_transducer(weighted, exponent, phases) if masking else weighted
     return energy_transducer(weighted * weighted) if masking else weighted.abs()
 
 
@@ -416,7 +407,7 @@ def _response_difference(
     other_scale: Tensor,
     other_sensitivity: Tensor,
     matrix: Tensor,
-    transducer: Transducer,
+    exponent: Tensor,
     signed: bool,
     masking: bool,
     phases: int,
@@ -426,9 +417,9 @@ def _response_difference(
     Each image by itself: equal images then take equal paths through the vectorised loops, and
     their difference is exactly 0.
     """
-    response = _response(details, scale, sensitivity, matrix, transducer, signed, masking, phases)
+    response = _response(details, scale, sensitivity, matrix, exponent, signed, masking, phases)
     other = _response(
-        other_details, other_scale, other_sensitivity, matrix, transducer, signed, masking, phases
+        other_details, other_scale, other_sensitivity, matrix, exponent, signed, masking, phases
     )
     return (response - other).abs() if signed else response - other
 

@@ -58,8 +58,8 @@ class CalibratedParameters:
         Butterworth sensitivity of C1 at 0 cycles/degree, 1/contrast; fc, cycles/degree; n.
     yellow_violet_gain, yellow_violet_cutoff, yellow_violet_order
         The same for C2.
-    transducer_exponent, transducer_start, transducer_knee
-        q, s, k of the signed transducer; no unit.
+    transducer_exponent
+        q of the signed transducer; no unit.
     summation_exponent
         In the place of Eq. 5's 2.4; no unit.
     lowpass_gains
@@ -89,8 +89,6 @@ class CalibratedParameters:
     yellow_violet_cutoff: float
     yellow_violet_order: float
     transducer_exponent: float
-    transducer_start: float
-    transducer_knee: float
     summation_exponent: float
     lowpass_gains: tuple[float, float, float]
     score_exponent: float
@@ -315,10 +313,9 @@ def csf_filtering(
 # Masking transducer
 
 
-def transducer(v: float, exponent: float, start: float, knee: float) -> float:
-    """Signed, for Eq. 4: psi(v) = c v (s + v^2) / (k + v^2)^(1 + q), psi(1) = 1."""
-    c = (knee + 1) ** (1 + exponent) / (start + 1)
-    return float(c * v * (start + v**2) / (knee + v**2) ** (1 + exponent))
+def transducer(v: float, exponent: float) -> float:
+    """Signed, for Eq. 4: psi(v) = 2^q v (1 + v^2)^(-q), q = ``exponent``; psi(1) = 1."""
+    return float(2**exponent * v * (1 + v**2) ** -exponent)
 
 
 def masking_transducer(
@@ -339,12 +336,7 @@ def masking_transducer(
         return weighted
     response = np.zeros(weighted.shape)
     for at in np.ndindex(weighted.shape):
-        response[at] = transducer(
-            float(weighted[at]),
-            parameters.transducer_exponent,
-            parameters.transducer_start,
-            parameters.transducer_knee,
-        )
+        response[at] = transducer(float(weighted[at]), parameters.transducer_exponent)
     return response
 
 
