@@ -492,9 +492,9 @@ def table(result: dict[str, Any]) -> str:
     hidden = result["masking"]
     lines += [
         "",
-        f"On its own pedestal, far above threshold, the increment of a Gabor patch rises with a "
-        f"slope of {hidden['slope']:.2f}, and at its lowest is {hidden['lowest_db']:+.1f} dB; it in dB at a pedestal in dB over "
-        "threshold: "
+        "A Gabor patch on its own pedestal: far above threshold its increment rises with a slope "
+        f"of {hidden['slope']:.2f}; at its lowest it is {hidden['lowest_db']:+.1f} dB. In dB over "
+        "threshold, at a pedestal in dB over threshold: "
         + ", ".join(
             f"{found:+.1f} at {pedestal:+.0f}"
             for pedestal, found in zip(hidden["pedestal_db"], hidden["increment_db"], strict=True)

@@ -31,7 +31,7 @@ Scene = Callable[[Plane, Plane], tuple[Plane, Plane, float]]
 PPD = 60.0
 WHITE = 100.0
 
-# Of the half-buffer's own stop. Cycles' default is 0.01, of its final image. Status: choice.
+# Of the half-buffer's own stop. Status: choice.
 NOISE_THRESHOLD = 0.02
 
 # A run that needs more samples a pixel has failed. Status: choice.

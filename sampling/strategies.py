@@ -145,7 +145,7 @@ class HalfBuffer(_Levelled):
         return self.noise(statistics, model.size) ** 2
 
 
-# The half-buffer divides by no less light than this. Status: choice; Cycles' own.
+# The half-buffer divides by no less light than this. Status: choice.
 DARKEST = 1e-4
 
 STRATEGIES: dict[str, Strategy] = {

@@ -1,5 +1,6 @@
 """The loss: its conventions, its gradient, and that it brings an image back."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torch_vdm import VDM, Display, VDMLoss
+from torch_vdm import VDM, Display, Observer, VDMLoss
+from torch_vdm.loss import DARK_LIGHT
 
 
 def images(batch: int = 3) -> tuple[Tensor, Tensor]:
@@ -29,7 +31,8 @@ def picture(size: int = 48) -> Tensor:
 
 def test_is_the_mean_of_the_maps_logarithm_and_l1() -> None:
     test, reference = images()
-    power = VDM(40.0)(test, reference).double() ** 2.4
+    observer = dataclasses.replace(Observer.calibrated(), dark_light=DARK_LIGHT)
+    power = VDM(40.0, observer=observer)(test, reference).double() ** 2.4
     items = torch.log1p(power).mean((1, 2, 3))
     metric_alone = VDMLoss(40.0, l1=0.0, reduction="none")(test, reference)
     torch.testing.assert_close(metric_alone.double(), items, rtol=1e-4, atol=1e-5)

@@ -87,21 +87,21 @@ def test_shares_are_the_derivative_of_the_largest_totals(observer: Observer) -> 
 
 @each_observer
 def test_the_simulated_maximum_is_the_true_one_on_average(observer: Observer) -> None:
-    """Over 24 runs of a flat wall with a fixed number of samples.
+    """Over 36 runs of a flat wall with a fixed number of samples.
 
-    The true maximum scatters by under 15 % from run to run, so that its mean is known to 3 %; the
+    The true maximum scatters by under 18 % from run to run, so that its mean is known to 3 %; the
     simulation is of 16 images a run. A tenth either way is three such errors.
     """
     metric = VDM(60.0, Display.linear(), observer)
     true, simulated = [], []
-    for seed in range(24):
+    for seed in range(36):
         renderer = wall(seed)
         statistics = drawn(renderer, 100)
         model = Model(metric, statistics, renderer.size)
         simulated.append(model.simulated().mean())
         truth = torch.from_numpy(np.moveaxis(renderer.mean, -1, 0)[None].copy())
         true.append(float(metric(model.mean, truth).max()))
-    assert np.std(true) < 0.15 * np.mean(true)
+    assert np.std(true) < 0.18 * np.mean(true)
     assert np.mean(true) / np.mean(simulated) == pytest.approx(1.0, abs=0.1)
 
 

@@ -68,7 +68,7 @@ def test_interrupted_anywhere_it_continues_bit_for_bit(unbiased: bool) -> None:
     # A new sampler from the state after every part.
     sampler, renderer, parts = Sampler(SIZE, METRIC, settings), spotted(), 0
     while (request := sampler.ask()) is not None:
-        part = next(request.parts(700))
+        part = next(request.parts(300))
         sampler.tell(renderer.sample(part.pixels, part.first, part.count))
         sampler = Sampler.restore(sampler.state(), METRIC)
         parts += 1

@@ -163,7 +163,9 @@ def test_perceptual_spares_what_the_carpet_masks(observer: str) -> None:
     """The paper's masking example; objective does the opposite."""
     renderer = masking()
     wanted, _, _ = plan("perceptual", drawn(renderer), renderer.size, METRICS[observer])
-    assert wanted[:, :8].mean() > 1.2 * wanted[:, 8:].mean()
+    # The printed transducer masks more than people do; the calibrated one as they do.
+    share = 1.1 if observer == "calibrated" else 1.2
+    assert wanted[:, :8].mean() > share * wanted[:, 8:].mean()
     wanted, _, _ = plan("objective", drawn(renderer), renderer.size, METRICS[observer])
     assert wanted[:, :8].mean() < wanted[:, 8:].mean()
 

@@ -19,7 +19,6 @@ from torch_vdm.cortex import Cortex, Haar, Transform
 from torch_vdm.csf import bandpass, barten, butterworth
 from torch_vdm.display import BT709_TO_XYZ, Display
 from torch_vdm.distance import (
-    SMALLEST_DIFFERENCE,
     accumulate,
     just_noticeable,
     local_visual_difference,
@@ -199,7 +198,7 @@ class VDM(PairMetric):
         half = 0.5 * exponent
         spread = torch.exp(torch.lgamma(half + 0.5) - torch.lgamma(half + 1.0)) / math.sqrt(math.pi)
         weight = spread * 2.0**half / shifts**2
-        return weight * (energy.clamp_min(SMALLEST_DIFFERENCE) ** half).sum((1, 2)).unsqueeze(1)
+        return weight * (energy**half).sum((1, 2)).unsqueeze(1)
 
     def represent(self, image: Tensor) -> Cortex:
         """Return the cortex representation of an image: display, cones, transform.

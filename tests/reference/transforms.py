@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from .calibrated import CalibratedParameters, lowpass_term, sensitivity
+from .calibrated import CalibratedParameters, glance_weight, lowpass_term, sensitivity
 from .paper import (
     ALL_ON,
     SML_TO_OPPONENT,
@@ -295,16 +295,25 @@ def score_sum(
     parameters: CalibratedParameters,
     exponent: float,
 ) -> float:
-    """Return the sum of the detection score over all details, before its root.
+    """Return the largest sum of the detection score, before its root, without the lowpass term.
 
     A quarter of the nodes are as many as side by side; and a cosine's mean power, found by summing
-    it up, is that of its absolute value and not that of its mean square.
+    it up, is that of its absolute value and not that of its mean square. A glance is one half node
+    wider than twice as many half nodes as nodes.
     """
     phase = np.linspace(0.0, 2.0 * math.pi, 100000, endpoint=False)
     spread = np.mean(np.abs(np.cos(phase)) ** exponent) / 0.5 ** (0.5 * exponent)
-    total = 0.0
-    for square in pair_differences(test, reference, ppd, kind, peaks, parameters):
+    height, width = test.shape[1:]
+    total = np.zeros((height, width))
+    window = 2 * parameters.score_window + 1
+    squares = pair_differences(test, reference, ppd, kind, peaks, parameters)
+    for level, square in enumerate(squares):
+        power = np.zeros(square.shape[2:])
         for orientation, channel in np.ndindex(square.shape[:2]):
             covered = box_over_shifts(square[orientation, channel], 1)
-            total += float(np.sum(covered ** (0.5 * exponent)))
-    return total * float(spread) / 4.0
+            power += covered ** (0.5 * exponent) * spread / 4.0
+        for y, x in np.ndindex(height, width):
+            for v, u in np.ndindex(power.shape):
+                down = glance_weight(y // 2**level - v, window)
+                total[y, x] += down * glance_weight(x // 2**level - u, window) * power[v, u]
+    return float(total.max())
