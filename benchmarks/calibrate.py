@@ -12,7 +12,7 @@ import hashlib
 import math
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from torch.func import functional_call, jacfwd
 
 from benchmarks import record
 from benchmarks.thresholds import (
+    OFF_CENTRE,
     Threshold,
     background,
     pattern,
@@ -92,30 +93,44 @@ class _Responses(nn.Module):
         return self.metric.respond(cortex)
 
 
-def gains(
-    observer: Observer, thresholds: list[Threshold], ppds: Array, free: dict[str, Tensor]
-) -> Tensor:
+class _View(NamedTuple):
+    """The thresholds that are drawn at one sampling."""
+
+    rows: list[int]
+    """Their numbers."""
+    responses: _Responses
+    cortex: Cortex
+    """A detail of their contrast on every level, on their background."""
+
+
+def views(observer: Observer, thresholds: list[Threshold], ppds: Array) -> list[_View]:
+    """Group thresholds by the pixels per degree at which they are drawn."""
+    groups = defaultdict(list)
+    for row, ppd in enumerate(ppds):
+        groups[float(ppd)].append(row)
+    found = []
+    for ppd, rows in groups.items():
+        light = torch.stack([background(thresholds[row].luminance) for row in rows])
+        contrast = torch.stack([torch.tensor(thresholds[row].contrast).double() for row in rows])
+        detail = (light * contrast).view(-1, 3, 1, 1, 1)
+        plane = light.view(-1, 3, 1, 1)
+        cortex = Cortex((detail,) * LEVELS, (plane,) * LEVELS, plane)
+        found.append(_View(rows, _Responses(observer, ppd), cortex))
+    return found
+
+
+def gains(of: list[_View], free: dict[str, Tensor]) -> Tensor:
     """Return the weighted contrast of a coefficient of 1 at the thresholds' contrast.
 
     (rows, levels, channels), the finest level first.
     """
-    rows: list[Tensor] = [torch.empty(0)] * len(thresholds)
-    groups = defaultdict(list)
-    for number, ppd in enumerate(ppds):
-        groups[float(ppd)].append(number)
-    for ppd, members in groups.items():
-        light = torch.stack([background(thresholds[n].luminance) for n in members])
-        contrast = torch.stack([torch.tensor(thresholds[n].contrast).double() for n in members])
-        detail = (light * contrast).view(-1, 3, 1, 1, 1)
-        plane = light.view(-1, 3, 1, 1)
-        cortex = Cortex((detail,) * LEVELS, (plane,) * LEVELS, plane)
-        module = _Responses(observer, ppd)
-        constants = {f"metric.{name}": value for name, value in free.items()}
-        responses = functional_call(module, constants, (cortex,))
-        found = torch.stack([r[:, :, 0, 0, 0] for r in reversed(responses)], 1)
-        for place, number in enumerate(members):
-            rows[number] = found[place]
-    return torch.stack(rows).abs()
+    constants = {f"metric.{name}": value for name, value in free.items()}
+    found: dict[int, Tensor] = {}
+    for view in of:
+        responses = functional_call(view.responses, constants, (view.cortex,))
+        levels = torch.stack([r[:, :, 0, 0, 0] for r in reversed(responses)], 1)
+        found |= zip(view.rows, levels, strict=True)
+    return torch.stack([found[row] for row in range(len(found))]).abs()
 
 
 def histograms(thresholds: list[Threshold], cycle: float, phase: float, window: int) -> Array:
@@ -144,7 +159,7 @@ def histograms(thresholds: list[Threshold], cycle: float, phase: float, window: 
 def _histogram(threshold: Threshold, ppd: float, phase: float, window: int) -> Array:
     drawn = pattern(threshold, ppd, phase)
     cortex = Haar().decompose(drawn[None, None])
-    middle = drawn.shape[-1] / 2 + 0.31 * ppd / threshold.scale
+    middle = drawn.shape[-1] / 2 + OFF_CENTRE * ppd / threshold.scale
     counts = np.zeros((LEVELS, len(BINS) - 1))
     for level, detail in enumerate(reversed(cortex.details[-LEVELS:])):
         nodes = torch.arange(detail.shape[-1]) + 0.5 - middle / 2.0 ** (level + 1)
@@ -164,7 +179,10 @@ class Model:
         drawings: tuple[tuple[float, float], ...],
     ) -> None:
         self.observer, self.thresholds = observer, thresholds
-        self.ppds = [np.array([sampling(t, cycle) for t in thresholds]) for cycle, _ in drawings]
+        self.views = [
+            views(observer, thresholds, np.array([sampling(t, cycle) for t in thresholds]))
+            for cycle, _ in drawings
+        ]
         # The sum over a histogram, as a table over the logarithm of a level's gain.
         self.start, self.step = -12.0, 0.1
         grid = torch.arange(self.start, 14.0, self.step, dtype=torch.float64)
@@ -180,8 +198,8 @@ class Model:
 
     def log_gains(self, free: dict[str, Tensor]) -> Tensor:
         """Return the logarithm of `gains`, (drawings, rows, levels, channels)."""
-        each = [gains(self.observer, self.thresholds, ppds, free) for ppds in self.ppds]
-        return torch.log(torch.stack(each).clamp_min(1e-12))
+        each = torch.stack([gains(drawn, free) for drawn in self.views])
+        return torch.log(each.clamp_min(1e-12))
 
     def log_score(self, log_gains: Tensor) -> tuple[Tensor, Tensor]:
         """Return the logarithm of the score, mean over the drawings, and its slope; (rows,)."""
@@ -218,12 +236,12 @@ class FormulaModel:
 
     def __init__(self, observer: Observer, thresholds: list[Threshold]) -> None:
         # The finest level of the Haar transform responds best at half a cycle a pixel.
-        self.observer, self.thresholds = observer, thresholds
-        self.ppds = np.array([2.0 * t.scale for t in thresholds])
+        self.thresholds = thresholds
+        self.views = views(observer, thresholds, np.array([2.0 * t.scale for t in thresholds]))
 
     def residual(self, free: dict[str, Tensor]) -> Tensor:
         """Return predicted over human threshold in dB, (rows,)."""
-        finest = gains(self.observer, self.thresholds, self.ppds, free)[:, 0]
+        finest = gains(self.views, free)[:, 0]
         seen = (finest**self.EXPONENT).sum(-1) ** (1.0 / self.EXPONENT)
         return -torch.log(seen) * DECIBELS
 
@@ -400,13 +418,13 @@ def masking(observer: Observer, pedestals: tuple[float, ...]) -> dict[str, Any]:
 def run(quick: bool, output: Path | None) -> None:
     torch.set_default_dtype(torch.float64)
     try:
-        result = calibrate(quick)
+        result = {**record.circumstances(), **calibrate(quick)}
     finally:
         torch.set_default_dtype(torch.float32)
     text = table(result)
     print(text)
     if output is not None:
-        record.save(output, "calibrate", {**record.circumstances(), **result}, text)
+        record.save(output, "calibrate", result, text)
 
 
 def calibrate(quick: bool) -> dict[str, Any]:
@@ -479,6 +497,8 @@ ROWS = {
 def table(result: dict[str, Any]) -> str:
     lines = [
         "# The calibrated observer, fitted to human thresholds",
+        "",
+        record.caption(result),
         "",
         "Predicted over human contrast threshold; one gain a study and mechanism unless stated.",
         "",

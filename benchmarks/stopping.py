@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.record import caption, circumstances, save
-from sampling import Report, Sampler, Settings, rounds
+from sampling import Sampler, Settings, rounds
 from sampling.renderers.synthetic import Synthetic
 from torch_vdm import VDM, Display, Observer
 
@@ -218,9 +218,7 @@ def _once(table: Table, name: str, seed: int) -> dict[str, float | str | None]:
         noise_threshold=table.noise_threshold,
     )
     sampler = Sampler(renderer.size, metric, settings)
-    report: Report
-    for report in rounds(sampler, renderer):  # noqa: B007  # the last one is wanted
-        pass
+    *_, report = rounds(sampler, renderer)
     image, truth = (
         torch.from_numpy(np.moveaxis(plane, -1, 0)[None].copy())
         for plane in (sampler.image, renderer.mean)

@@ -16,6 +16,10 @@ TABLE = Path(__file__).parent / "data" / "contrast_thresholds.csv"
 # backgrounds are given in other cone fundamentals than Eq. 1's.
 D65 = (0.95047, 1.0, 1.08883)
 
+# How far a stimulus lies off the centre of its image, in cycles: no observer places it on a grid.
+# Status: choice.
+OFF_CENTRE = 0.31
+
 # A Gabor patch is drawn to this many standard deviations. Status: choice.
 EXTENT = 3.5
 
@@ -97,8 +101,7 @@ def sampling(threshold: Threshold, cycle: float) -> float:
 def pattern(threshold: Threshold, ppd: float, phase: float) -> Tensor:
     """Return the stimulus (H, W), float64, at a contrast of 1, ``phase`` in radians.
 
-    Its centre lies off the centre of the image by a part of a cycle, for no observer places it on
-    a grid.
+    Its centre lies `OFF_CENTRE` off that of the image.
     """
     half = math.sqrt(threshold.area) / 2.0
     if threshold.stimulus == "disk":
@@ -107,7 +110,7 @@ def pattern(threshold: Threshold, ppd: float, phase: float) -> Tensor:
         half = EXTENT * threshold.sigma
     span = (2.0 * half + 2.0 / threshold.scale) * ppd
     side = min(2 ** math.ceil(math.log2(max(64.0, span))), LARGEST_SIDE)
-    x = (torch.arange(side, dtype=torch.float64) - side / 2) / ppd - 0.31 / threshold.scale
+    x = (torch.arange(side, dtype=torch.float64) - side / 2) / ppd - OFF_CENTRE / threshold.scale
     y = x.unsqueeze(1)
     if threshold.stimulus == "disk":
         disc: Tensor = x * x + y * y < half * half

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_vdm.cortex import Cortex
+from torch_vdm.quadtree import share
 
 # Distance of the quartiles of a normal distribution from its mean, in standard deviations.
 QUARTILE = 0.6744897501960817
@@ -82,14 +83,14 @@ def _axis(side: int, node: int, count: int, true_means: bool) -> _Axis:
     nodes = torch.arange(2 * parents).view(parents, 2).T.contiguous()
     low = torch.full((2, parents), 0.25, dtype=torch.float64)
     high, own = low.clone(), low.clone()
-    share = (side % node or node) / node
+    real = share(side, node)
 
     def squares(first: float, second: float) -> Tensor:
         return torch.tensor([first**2, second**2], dtype=torch.float64)
 
     # The pixels that the last node lacks are like the node before it; without a sibling its window
     # reaches back over that one, or it stands beside itself.
-    half = 0.5 * share
+    half = 0.5 * real
     if count % 2 == 1:
         nodes[:, -1] = torch.tensor([count - 1, max(count - 2, 0)])
         own[:, -1] = squares(1.0, 0.0)
@@ -98,7 +99,7 @@ def _axis(side: int, node: int, count: int, true_means: bool) -> _Axis:
         high[:, -1] = squares(half, half) if reaches else 0.0
     elif true_means:
         low[:, -1], high[:, -1] = squares(1.0 - half, half), squares(half, half)
-        own[:, -1] = squares(1.0, share) / (1.0 + share) ** 2
+        own[:, -1] = squares(1.0, real) / (1.0 + real) ** 2
     return _Axis(nodes, low, high, own)
 
 

@@ -2,9 +2,7 @@
 
 import argparse
 import contextlib
-import io
 import json
-import os
 import shlex
 import signal
 import sys
@@ -21,21 +19,24 @@ import torch
 
 from sampling import checkpoint
 from sampling.renderers.mitsuba import VARIANTS, MitsubaRenderer
-from sampling.sampler import Report, Sampler, Settings
+from sampling.sampler import Report, Sampler, Settings, under
 from sampling.strategies import STRATEGIES
 from torch_vdm import VDM, Display, __version__
 from torch_vdm.cli import (
-    BAD_INPUT,
     DONE,
     INTERRUPTED,
     OBSERVERS,
     PPD,
     WHITE,
     Parser,
+    UsageError,
+    check_outputs,
+    json_path,
     positive,
+    run,
     tell,
 )
-from torch_vdm.io import atomic_path, check_target, write_channels
+from torch_vdm.io import atomic_path, write_channels
 
 # Seconds between two checkpoints. Status: choice.
 CHECKPOINT_SECONDS = 30.0
@@ -54,27 +55,11 @@ FEW_PIXELS = 2**18
 LINE_SECONDS = 0.2
 
 
-class _UsageError(ValueError):
-    """Options that do not fit together."""
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vdm-render``; return its exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     options = _parser().parse_args(words)
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        # A file's name may have letters that the terminal lacks.
-        sys.stdout.reconfigure(errors="backslashreplace")
-    try:
-        return _run(options, words)
-    except ValueError as error:  # of the library, one line each
-        print(f"vdm-render: {error}", file=sys.stderr)
-    except OSError as error:
-        print(f"vdm-render: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
-    except KeyboardInterrupt:
-        print("vdm-render: interrupted", file=sys.stderr)
-        return INTERRUPTED
-    return BAD_INPUT
+    return run("vdm-render", lambda: _run(options, words))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -401,14 +386,7 @@ def _resumed(
         return None
     state = checkpoint.load(path, identity)
     try:
-        sampler = Sampler.restore(
-            {
-                name.removeprefix("sampler."): value
-                for name, value in state.items()
-                if name.startswith("sampler.")
-            },
-            metric,
-        )
+        sampler = Sampler.restore(under("sampler.", state), metric)
         progress.samples = state["progress.samples"]
         progress.seconds_render = state["progress.seconds_render"]
         progress.seconds_metric = state["progress.seconds_metric"]
@@ -426,23 +404,9 @@ def _resumed(
 def _check(options: argparse.Namespace) -> None:
     """Refuse, before anything is rendered, what could not be written or would destroy an input."""
     if options.output.suffix.lower() != ".exr":
-        raise _UsageError(f"{options.output}: expected a name that ends in .exr")
-    taken = {Path(os.path.realpath(options.scene)): options.scene}
-    for path in (
-        options.output,
-        options.checkpoint,
-        Path(options.json) if options.json not in (None, "-") else None,
-    ):
-        if path is None:
-            continue
-        target = Path(os.path.realpath(path))
-        if target in taken:
-            raise _UsageError(
-                f"{path}: expected a file of its own to write to, got {taken[target]} again; "
-                "choose another name"
-            )
-        check_target(target)
-        taken[target] = path
+        raise UsageError(f"{options.output}: expected a name that ends in .exr")
+    outputs = (options.output, options.checkpoint, json_path(options))
+    check_outputs((options.scene,), outputs)
 
 
 def _plan(renderer: MitsubaRenderer, options: argparse.Namespace) -> dict[str, Any]:

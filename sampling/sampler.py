@@ -269,12 +269,12 @@ class Sampler:
                 f"expected a state of version {STATE_VERSION}, got {state.get('version')}"
             )
         size = (int(state["height"]), int(state["width"]))
-        sampler = cls(size, metric, Settings(**_under("settings.", state)))
+        sampler = cls(size, metric, Settings(**under("settings.", state)))
         sampler._rounds = int(state["rounds"])
         sampler._decided = state["decided"]
         sampler._target = np.array(state["target"], np.int64)
-        sampler._statistics = Statistics.restored(_under("statistics.", state))
-        report = _under("report.", state)
+        sampler._statistics = Statistics.restored(under("statistics.", state))
+        report = under("report.", state)
         sampler._report = Report(**report) if report else None
         return sampler
 
@@ -382,6 +382,6 @@ def rounds(sampler: Sampler, renderer: Renderer, at_once: int = 2**20) -> Iterat
             sampler.tell(renderer.sample(part.pixels, part.first, part.count))
 
 
-def _under(prefix: str, state: dict[str, Any]) -> dict[str, Any]:
+def under(prefix: str, state: dict[str, Any]) -> dict[str, Any]:
     """Return the entries whose names begin with a prefix, without it."""
     return {name.removeprefix(prefix): v for name, v in state.items() if name.startswith(prefix)}

@@ -4,6 +4,7 @@ Four strategies under one contract. Each says how many samples every pixel shoul
 of the next round, so that the model itself predicts the tolerance; none decides when to stop.
 """
 
+from abc import ABC, abstractmethod
 from typing import Protocol
 
 import numpy as np
@@ -72,14 +73,14 @@ class Perceptual:
         return _grown(model, worth, max(high, float(np.log(SMALLEST_GROWTH))))
 
 
-class _Levelled:
+class _Levelled(ABC):
     """Evens out an error that falls as one over the samples, down to one level for all pixels."""
 
     halves = False
 
+    @abstractmethod
     def error(self, model: Model, statistics: Statistics) -> Plane:
         """Return the error of every pixel, (H, W), not negative."""
-        raise NotImplementedError
 
     def wanted(self, model: Model, statistics: Statistics, goal: float) -> Plane:
         """Find the highest level of error at which the model predicts the goal."""

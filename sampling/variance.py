@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from sampling.statistics import FIRST, SECOND, Statistics, scalar_second
+from torch_vdm.quadtree import push
 
 Plane = NDArray[np.float64]
 
@@ -111,5 +112,5 @@ def _four(plane: Plane) -> Plane:
 
 
 def _push(plane: Plane, size: tuple[int, ...]) -> Plane:
-    """Give every child on a plane of ``size`` the value of its parent."""
-    return plane.repeat(2, 1).repeat(2, 2)[:, : size[0], : size[1]]
+    """Give every child on a plane of ``size`` = (h, w) the value of its parent."""
+    return push(torch.from_numpy(plane)[None], (size[0], size[1]))[0].numpy()

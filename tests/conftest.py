@@ -1,5 +1,6 @@
-"""Where test data lives, and what images tests are made of."""
+"""Where test data lives, what images tests are made of, and the reference's observer."""
 
+import dataclasses
 import os
 from pathlib import Path
 
@@ -8,6 +9,9 @@ import pytest
 import torch
 from hypothesis import settings
 from numpy.typing import NDArray
+
+from tests.reference import calibrated
+from torch_vdm import Observer
 
 settings.register_profile("default", deadline=None, derandomize=True, max_examples=40)
 settings.load_profile("default")
@@ -49,3 +53,12 @@ def make_xyz(kind: str, height: int, width: int, seed: int) -> NDArray[np.float6
             return rng.uniform(-0.5, 20.0, shape)
         case _:
             raise ValueError(kind)
+
+
+def reference_numbers() -> calibrated.CalibratedParameters:
+    """Return the calibrated observer's numbers as the reference takes them."""
+    names = {field.name for field in dataclasses.fields(calibrated.CalibratedParameters)}
+    observer = Observer.calibrated()
+    return calibrated.CalibratedParameters(
+        **{name: value for name, value in vars(observer).items() if name in names}
+    )

@@ -1,6 +1,5 @@
 """StationaryHaar and Steerable against the NumPy reference, and what holds of every transform."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -11,8 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tests.conftest import KINDS, make_xyz
-from tests.reference import calibrated, transforms
+from tests.conftest import KINDS, make_xyz, reference_numbers
+from tests.reference import transforms
 from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, VDMLoss
 from torch_vdm.cortex import Transform
 
@@ -78,12 +77,6 @@ def test_is_the_reference(transform: Transform, kind: str, size: tuple[int, int]
             np.testing.assert_allclose(ours, lowpass, rtol=1e-9, atol=atol)
 
 
-def parameters_of(observer: Observer) -> calibrated.CalibratedParameters:
-    names = {field.name for field in dataclasses.fields(calibrated.CalibratedParameters)}
-    numbers = {name: value for name, value in vars(observer).items() if name in names}
-    return calibrated.CalibratedParameters(**numbers)
-
-
 @each_overlapping
 @pytest.mark.parametrize("kind", ["random", "hdr", "dark", "negative"])
 @pytest.mark.parametrize("size", [(1, 1), (7, 10)])
@@ -96,7 +89,7 @@ def test_the_map_and_the_score_are_the_references(
     peaks = [transform.peaks(level)[0] for level in range(8)]
     metric = VDM(PPD, Display.xyz(), observer, transform)
     images = [torch.from_numpy(image)[None] for image in (first, second)]
-    arguments = (first, second, PPD, kind_of, peaks, parameters_of(observer))
+    arguments = (first, second, PPD, kind_of, peaks, reference_numbers())
     expected = transforms.jnd_map(*arguments)
     np.testing.assert_allclose(metric(*images)[0, 0].numpy(), expected, rtol=1e-9, atol=1e-9)
     single = metric(*(image.float() for image in images))[0, 0].double().numpy()

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tests.conftest import KINDS, make_xyz
+from tests.conftest import KINDS, make_xyz, reference_numbers
 from tests.reference import calibrated, paper
 from torch_vdm import VDM, Display, Effects, Observer
 
@@ -24,15 +24,6 @@ sizes = st.one_of(
     st.tuples(st.integers(1, 20), st.integers(1, 20)),
     st.sampled_from([(1, 1), (1, 33), (33, 1), (2, 2), (16, 16), (31, 17)]),
 )
-
-
-def reference_numbers() -> calibrated.CalibratedParameters:
-    """Return the calibrated observer's numbers as the reference takes them."""
-    names = {field.name for field in dataclasses.fields(calibrated.CalibratedParameters)}
-    observer = Observer.calibrated()
-    return calibrated.CalibratedParameters(
-        **{name: value for name, value in vars(observer).items() if name in names}
-    )
 
 
 def reference_map(

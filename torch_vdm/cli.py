@@ -8,7 +8,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -48,7 +48,7 @@ TRANSFORMS: dict[str, type[Transform]] = {
 OBSERVERS = {"calibrated": Observer.calibrated, "paper": Observer.paper}
 
 
-class _UsageError(ValueError):
+class UsageError(ValueError):
     """Options that do not fit together."""
 
 
@@ -64,23 +64,35 @@ class Parser(argparse.ArgumentParser):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``torch-vdm``; return its exit status."""
     options = _parser().parse_args(arguments)
+    return run("torch-vdm", lambda: _command(options))
+
+
+def run(program: str, command: Callable[[], int]) -> int:
+    """Run a command; return its exit status, for an error after one line that begins with its name.
+
+    ``command`` returns the status of a run without an error.
+    """
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A file's name may have letters that the terminal lacks.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        if options.command == "demo":
-            sample = files("torch_vdm") / "sample"
-            with as_file(sample / "reference.exr") as one, as_file(sample / "test.exr") as other:
-                return _compare(one, other, options)
-        return _compare(options.reference, options.test, options)
+        return command()
     except ValueError as error:  # of the library, one line each; ImageError is one
-        print(f"torch-vdm: {error}", file=sys.stderr)
+        print(f"{program}: {error}", file=sys.stderr)
     except OSError as error:
-        print(f"torch-vdm: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
+        print(f"{program}: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
     except KeyboardInterrupt:
-        print("torch-vdm: interrupted", file=sys.stderr)
+        print(f"{program}: interrupted", file=sys.stderr)
         return INTERRUPTED
     return BAD_INPUT
+
+
+def _command(options: argparse.Namespace) -> int:
+    if options.command == "demo":
+        sample = files("torch_vdm") / "sample"
+        with as_file(sample / "reference.exr") as one, as_file(sample / "test.exr") as other:
+            return _compare(one, other, options)
+    return _compare(options.reference, options.test, options)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -190,7 +202,7 @@ class _Pair:
 
 
 def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
-    _check_outputs((reference, test), options)
+    check_outputs((reference, test), (options.map, json_path(options)))
     ppd, seen_from = _viewing(options)
     pair = _load_pair(reference, test, options)
     transform = TRANSFORMS[options.accuracy]()
@@ -232,20 +244,28 @@ def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
     return EXCEEDED if exceeded else DONE
 
 
-def _check_outputs(inputs: tuple[Path, Path], options: argparse.Namespace) -> None:
-    """Refuse, before anything is computed, what could not be written or would destroy an input."""
+def check_outputs(inputs: Sequence[Path], outputs: Sequence[Path | None]) -> None:
+    """Refuse, before anything is computed, what could not be written or would destroy an input.
+
+    An output that is None is not asked for.
+    """
     taken = {Path(os.path.realpath(path)): path for path in inputs}
-    for path in (options.map, Path(options.json) if options.json not in (None, "-") else None):
+    for path in outputs:
         if path is None:
             continue
         target = Path(os.path.realpath(path))
         if target in taken:
-            raise _UsageError(
+            raise UsageError(
                 f"{path}: expected a file of its own to write to, got {taken[target]} again; "
                 "choose another name"
             )
         check_target(target)
         taken[target] = path
+
+
+def json_path(options: argparse.Namespace) -> Path | None:
+    """Return the file that ``--json`` names; None without one and for standard output."""
+    return Path(options.json) if options.json not in (None, "-") else None
 
 
 def tell(text: str) -> None:
@@ -264,7 +284,7 @@ def _viewing(options: argparse.Namespace) -> tuple[float, str]:
     geometry = (options.screen, options.diagonal, options.distance)
     given = [part for part in geometry if part is not None]
     if given and (options.ppd is not None or len(given) < 3):
-        raise _UsageError(
+        raise UsageError(
             "expected --ppd alone, or --screen, --diagonal and --distance together; "
             "give one of the two"
         )

@@ -12,6 +12,9 @@ SIZE_TERM, SIZE_FREQUENCY = 12.0, 3.0
 FALL, FALL_LUMINANCE, FALL_EXPONENT = 0.3, 100.0, 0.15
 KNEE = 0.06
 
+# Octaves from the peak are held to this, so that their root has a finite slope. Status: choice.
+SMALLEST_OFFSET = 1e-12
+
 
 def barten(frequency: Tensor, luminance: Tensor, size: Tensor) -> Tensor:
     """Return the achromatic contrast sensitivity of Barten 1989, S(u).
@@ -38,19 +41,12 @@ def barten(frequency: Tensor, luminance: Tensor, size: Tensor) -> Tensor:
     return a * frequency * falling * torch.sqrt(falling * falling + KNEE)
 
 
-# The fitted achromatic sensitivity falls as exp(-(octaves / width)^FLANK) from its peak: between an
-# exponential, which is too pointed, and a parabola, which falls too fast. Status: choice.
-FLANK = 1.5
-
-# Octaves from the peak are held to this, so that their root has a finite slope. Status: choice.
-SMALLEST_OFFSET = 1e-12
-
-
 def bandpass(octaves: Tensor, width: Tensor, floor: Tensor) -> Tensor:
     """Return a sensitivity relative to its peak, between 0 and 1, ``octaves`` above the peak.
 
     exp(-(octaves / width)^1.5) over the peak; below it the same curve down to ``floor``, for
-    sensitivity levels off at low frequency.
+    sensitivity levels off at low frequency. The exponent is a choice: an exponential is too
+    pointed, a parabola falls too fast.
     """
     offset = octaves.abs().clamp_min(SMALLEST_OFFSET) / width
     falling = torch.exp(-offset * torch.sqrt(offset))

@@ -20,14 +20,8 @@ class PairMetric(nn.Module):
 
     Parameters
     ----------
-    ppd
-        Pixels in one degree of the visual field; see `pixels_per_degree`.
-    display
-        What the pixel values are; `Display.srgb()` by default.
-    nonfinite
-        "raise": NaN or infinity in an image is a ValueError that names the batch item (a graph
-        of torch.compile cannot raise: there it gives NaN). "mask": such pixels are taken as
-        equal in both images, and the map is 0 there; nothing is read back from the device.
+    ppd, display, nonfinite
+        As in `VDM`.
 
     Raises
     ------
@@ -94,7 +88,8 @@ class PairMetric(nn.Module):
             (B, 1, H, W), JND.
         """
         total, seen = self._total(test, reference)
-        jnd = just_noticeable(total, self._constants(total.dtype)["summation_exponent"])
+        constants = self._constants(total.dtype, "summation_exponent")
+        jnd = just_noticeable(total, constants["summation_exponent"])
         return _masked(self._to_pixels(jnd, (test.shape[-2], test.shape[-1])), seen)
 
     def power(self, test: Tensor, reference: Tensor) -> Tensor:
@@ -106,9 +101,10 @@ class PairMetric(nn.Module):
         total, seen = self._total(test, reference)
         return _masked(self._to_pixels(total, (test.shape[-2], test.shape[-1])), seen)
 
-    def _constants(self, dtype: torch.dtype) -> dict[str, Tensor]:
-        """Return the constants in the precision of the computation."""
-        return {name: value.to(dtype) for name, value in self.named_buffers()}
+    def _constants(self, dtype: torch.dtype, *names: str) -> dict[str, Tensor]:
+        """Return constants in the precision of the computation: those named, or all."""
+        buffers = {name: getattr(self, name) for name in names} or dict(self.named_buffers())
+        return {name: value.to(dtype) for name, value in buffers.items()}
 
     def _total(self, test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor | None]:
         test, reference, seen = self._checked(test, reference)

@@ -133,7 +133,7 @@ class Sarnoff(PairMetric):
         return weights
 
     def _accumulated(self, test: Tensor, reference: Tensor) -> Tensor:
-        sensitivities = self._constants(test.dtype)["sensitivities"]
+        sensitivities = self._constants(test.dtype, "sensitivities")["sensitivities"]
         first, second = self._pyramid(test), self._pyramid(reference)
         total: Tensor | None = None
         for octave in reversed(range(OCTAVES)):
@@ -149,7 +149,7 @@ class Sarnoff(PairMetric):
 
     def _local_difference(self, first: Tensor, second: Tensor, sensitivity: Tensor) -> Tensor:
         """Return the local visual difference (B, 1, h, w) of two contrast planes of a band."""
-        exponent = self._constants(first.dtype)["summation_exponent"]
+        exponent = self._constants(first.dtype, "summation_exponent")["summation_exponent"]
         filtered = step(oriented.across, first, self._fast)
         difference = step(_response_difference, first, self._fast)
         gather = step(_pooled_difference, first, self._fast)
@@ -177,7 +177,7 @@ class Sarnoff(PairMetric):
 
     def _pyramid(self, image: Tensor) -> list[Tensor]:
         """Return the lowpass planes of the luminance after the optics, the finest first."""
-        matrix = self._constants(image.dtype)["luminance"]
+        matrix = self._constants(image.dtype, "luminance")["luminance"]
         plane = step(_luminance, image, self._fast)(image, self.display, matrix)
         for blur in (_blurred_along_rows, _blurred_along_columns):
             plane = step(blur, plane, self._fast)(plane, self._spread)

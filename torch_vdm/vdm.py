@@ -15,7 +15,7 @@ from torch_vdm.contrast import (
     opponents,
     weber_contrast,
 )
-from torch_vdm.cortex import Cortex, Haar, Transform
+from torch_vdm.cortex import DEEPEST, Cortex, Haar, Transform
 from torch_vdm.csf import bandpass, barten, butterworth
 from torch_vdm.display import BT709_TO_XYZ, Display
 from torch_vdm.distance import (
@@ -33,9 +33,6 @@ from torch_vdm.pair import Nonfinite, PairMetric
 from torch_vdm.pooling import glance, phase_energy, pool, pool_halves, surround, surround_halves
 from torch_vdm.quadtree import push
 from torch_vdm.sarnoff import Sarnoff
-
-# Levels that the constants are made for: an image of 2^24 pixels a side.
-DEEPEST = 24
 
 # Planes with more numbers are computed in parts. Status: choice, measured.
 LARGEST_AT_ONCE = 2**20
@@ -169,7 +166,7 @@ class VDM(PairMetric):
         cycles, where the map stays local.
         """
         test, reference, _ = self._checked(test, reference)
-        constants = self._constants(test.dtype)
+        constants = self._constants(test.dtype, "score_exponent", "score_coefficients")
         exponent, coefficients = constants["score_exponent"], constants["score_coefficients"]
         totals = []
         for one, other in self._parts(test, reference):
@@ -205,7 +202,7 @@ class VDM(PairMetric):
 
         ``image`` is (B, 3, H, W) in float32 or float64, as the display expects it.
         """
-        constants = self._constants(image.dtype)
+        constants = self._constants(image.dtype, "primaries", "cones")
         around = self.display, constants["primaries"], constants["cones"]
         if self._fast:
             planes: Tensor = compiled(_light)(image, *around)
@@ -242,9 +239,9 @@ class VDM(PairMetric):
         them. A uniform change is seen here and nowhere else.
         """
         one, other = first.mean, second.mean
-        constants = self._constants(one.dtype)
         if self.observer.lowpass_gains is None:
             return 0.0 * one[:, :1]  # of the graph, so that an image of one pixel has a gradient
+        constants = self._constants(one.dtype, "dark_cones", "opponents", "lowpass_gains")
         contrast = weber_contrast(one, other, constants["dark_cones"])
         gains = constants["lowpass_gains"].view(-1, 1, 1)
         return (opponents(contrast, constants["opponents"]) * gains).abs()
@@ -255,7 +252,7 @@ class VDM(PairMetric):
         (B, 1, h, w) of the finest level. The responses of a level are taken and dropped one
         level at a time, which bounds memory.
         """
-        constants = self._constants(first.lowpass[0].dtype)
+        constants = self._constants(first.lowpass[0].dtype, "summation_exponent")
         root = self.lowpass_difference(first, second) ** constants["summation_exponent"]
         local = self.local_differences(first, second)
         return accumulate(local, root.sum(1, keepdim=True))
@@ -304,7 +301,7 @@ class VDM(PairMetric):
                 constants["transducer_exponent"],
                 self.observer.signed,
                 self.effects.masking,
-                self.transform.phases,
+                phases,
             )
             local.append(self._gathered(difference, constants["summation_exponent"], fast))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]

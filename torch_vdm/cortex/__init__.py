@@ -3,6 +3,6 @@
 from torch_vdm.cortex.haar import Haar
 from torch_vdm.cortex.stationary import StationaryHaar
 from torch_vdm.cortex.steerable import Steerable
-from torch_vdm.cortex.transform import Cortex, Transform
+from torch_vdm.cortex.transform import DEEPEST, Cortex, Transform
 
-__all__ = ["Cortex", "Haar", "StationaryHaar", "Steerable", "Transform"]
+__all__ = ["DEEPEST", "Cortex", "Haar", "StationaryHaar", "Steerable", "Transform"]

@@ -12,6 +12,7 @@ from torch.nn import functional
 from torch_vdm.cortex.haar import Haar
 from torch_vdm.cortex.transform import Cortex
 from torch_vdm.fast import SMALLEST, compiled
+from torch_vdm.quadtree import share
 
 # The exponent of the sum over orientations by which a diagonal grating is made as strong as a
 # vertical one; that of the detection score. Status: choice.
@@ -72,16 +73,16 @@ class StationaryHaar:
 def _faded(parts: Tensor, size: tuple[int, int], node: int) -> Tensor:
     """Weaken a last row or column that has only a share r of its pixels.
 
-    R becomes L + 2 r / (1 + r) (R - L), where L is its
-    neighbour, so that (L + R) / 2 is the mean of the real pixels of both.
+    R becomes L + 2 r / (1 + r) (R - L), where L is its neighbour, so that (L + R) / 2 is the mean
+    of the real pixels of both.
     """
     for side, axis in zip(size, (-2, -1), strict=True):
         count = parts.shape[axis]
-        share = (side % node or node) / node
-        if count == 1 or share == 1.0:
+        real = share(side, node)
+        if count == 1 or real == 1.0:
             continue
         before, last = parts.narrow(axis, count - 2, 1), parts.narrow(axis, count - 1, 1)
-        last = before + 2.0 * share / (1.0 + share) * (last - before)
+        last = before + 2.0 * real / (1.0 + real) * (last - before)
         parts = torch.cat((parts.narrow(axis, 0, count - 1), last), axis)
     return parts
 

@@ -11,15 +11,12 @@ from torch.nn import functional
 
 from torch_vdm.cortex import oriented
 from torch_vdm.cortex.gaussian import blur, lowpass_response, step
-from torch_vdm.cortex.transform import Cortex
+from torch_vdm.cortex.transform import DEEPEST, Cortex
 from torch_vdm.fast import SMALLEST
 
 # The image half-way between its pixels, which the finest level needs: a sinc of so many taps on
 # either side, under a Hann window. Status: choice.
 HALFWAY = 8
-
-# Levels that peaks are found for: an image of 2^24 pixels a side.
-DEEPEST = 24
 
 # Planes with more numbers are filtered in bands of rows, which stay in the processor's cache.
 # Status: choice, measured.

@@ -4,6 +4,9 @@ from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
+# Levels that constants are made for: an image of 2^24 pixels a side.
+DEEPEST = 24
+
 
 class Cortex(NamedTuple):
     """The cortex representation of a batch of images; level 0 is the root.
