@@ -227,7 +227,7 @@ class VDM(TiledMetric):
             planes: Tensor = compiled(_light)(image, *around)
             return planes
         rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
-        return torch.cat([_light(part, *around) for part in image.split(rows, -2)], -2)
+        return torch.cat([self._kept(_light, part, *around) for part in image.split(rows, -2)], -2)
 
     def respond(self, cortex: Cortex) -> tuple[Tensor, ...]:
         """Return the responses of one image: chromatic aberration to the transducer.
@@ -311,7 +311,8 @@ class VDM(TiledMetric):
         for plane in range(0, one.shape[2], at_once):
             some = slice(plane, plane + at_once)
             same = some if sensitivity.shape[2] > 1 else slice(None)
-            difference = respond(
+
+            arguments = (
                 one[:, :, some],
                 other[:, :, some],
                 scale,
@@ -324,7 +325,12 @@ class VDM(TiledMetric):
                 self.effects.masking,
                 phases,
             )
-            local.append(self._gathered(difference, constants["summation_exponent"], fast))
+
+            def gathered(*arguments: Any) -> Tensor:
+                difference = respond(*arguments)
+                return self._gathered(difference, constants["summation_exponent"], fast)
+
+            local.append(self._kept(gathered, *arguments))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]
 
     def _gathered(self, difference: Tensor, exponent: Tensor, fast: bool) -> Tensor:
