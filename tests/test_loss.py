@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torch_vdm import VDM, Display, Observer, VDMLoss
+from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, VDMLoss
+from torch_vdm.cortex import Transform
 from torch_vdm.loss import DARK_LIGHT
 
 
@@ -147,3 +148,58 @@ def test_orders_images_as_the_map_does_near_threshold() -> None:
         losses = [VDMLoss(l1=weight)(test, reference).item() for test in tests]
         ranks = np.argsort(np.argsort(jnd)), np.argsort(np.argsort(losses))
         assert np.corrcoef(*ranks)[0, 1] > least, weight
+
+
+@pytest.mark.parametrize("transform", [Haar(), StationaryHaar(), Steerable()])
+def test_a_checkpoint_changes_no_gradient(
+    transform: Transform, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch_vdm.vdm.LARGEST_AT_ONCE", 1000)  # in parts, as a large image is
+    generator = torch.Generator().manual_seed(5)
+    test, reference = torch.rand(2, 2, 3, 37, 50, dtype=torch.float64, generator=generator)
+    test.requires_grad_()
+    gradients: list[Tensor] = []
+    kept: list[dict[int, int]] = []
+
+    def keep(tensor: Tensor) -> Tensor:
+        kept[-1][tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        return tensor
+
+    for checkpoint in (False, True):
+        loss = VDMLoss(transform=transform, checkpoint=checkpoint)
+        kept.append({})
+        with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+            value = loss(test, reference)
+        gradients.append(torch.autograd.grad(value, test)[0])
+    torch.testing.assert_close(gradients[1], gradients[0], rtol=0.0, atol=1e-12)
+    # Not counted: the checkpoints' own arguments, which are details and their scale.
+    assert sum(kept[1].values()) < 0.5 * sum(kept[0].values())
+
+
+def test_a_checkpoint_can_be_differentiated_twice() -> None:
+    generator = torch.Generator().manual_seed(2)
+    test, reference = torch.rand(2, 1, 3, 3, 4, dtype=torch.float64, generator=generator) + 0.1
+    loss = VDMLoss(20.0, checkpoint=True)
+    assert torch.autograd.gradcheck(lambda image: loss(image, reference), test.requires_grad_())
+    assert torch.autograd.gradgradcheck(lambda image: loss(image, reference), test)
+
+
+@pytest.mark.parametrize("observer", [Observer.calibrated(), Observer.paper()])
+@pytest.mark.parametrize("transform", [Haar(), StationaryHaar(), Steerable()])
+def test_derivatives_of_every_transform_are_those_of_the_formula(
+    observer: Observer, transform: Transform
+) -> None:
+    generator = torch.Generator().manual_seed(7)
+    test, reference = torch.rand(2, 1, 3, 2, 3, dtype=torch.float64, generator=generator) + 0.1
+    loss = VDMLoss(20.0, observer=observer, transform=transform)
+    assert torch.autograd.gradcheck(lambda image: loss(image, reference), test.requires_grad_())
+    assert torch.autograd.gradgradcheck(lambda image: loss(image, reference), test)
+
+
+def test_mask_values_are_checked() -> None:
+    test, reference = images()
+    mask = torch.ones(3, 1, 13, 18)
+    for value in (-1.0, float("nan"), float("inf")):
+        mask[1, 0, 2, 3] = value
+        with pytest.raises(ValueError, match="finite mask values of 0 or more"):
+            VDMLoss()(test, reference, mask)

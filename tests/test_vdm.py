@@ -163,6 +163,27 @@ def test_fast_route_answers_the_same() -> None:
     assert torch.equal(pickle.loads(pickle.dumps(fast))(*pair), fast(*pair))
 
 
+def test_the_fast_route_is_never_compiled_again() -> None:
+    # The list: any height, width and batch with no side of one pixel, after one call for each of
+    # the two ways that gradients are asked for.
+    from torch._dynamo.utils import counters
+
+    fast = VDM().compile()
+
+    def call(*shape: int) -> None:
+        pair = images(*shape)
+        with torch.no_grad():
+            fast(*pair)
+        fast.power(pair[0].requires_grad_(), pair[1]).sum().backward()
+
+    call(1, 40, 56)
+    graphs = counters["stats"]["unique_graphs"]
+    assert graphs > 0
+    for shape in ((1, 64, 64), (3, 33, 80), (2, 80, 33), (1, 101, 47), (5, 40, 56), (1, 2, 1400)):
+        call(*shape)
+        assert counters["stats"]["unique_graphs"] == graphs, shape
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_input_is_computed_in_float32(dtype: torch.dtype) -> None:
     metric = VDM()

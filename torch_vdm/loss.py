@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from torch_vdm.display import Display
 from torch_vdm.observer import Observer
+from torch_vdm.pair import has_values
 from torch_vdm.vdm import VDM
 
 Reduction = Literal["mean", "sum", "none"]
@@ -112,6 +113,13 @@ def _mean(plane: Tensor, mask: Tensor | None) -> Tensor:
     if mask.shape != plane.shape:
         raise ValueError(f"expected a mask of shape {tuple(plane.shape)}, got {tuple(mask.shape)}")
     weights = mask.to(plane.dtype)
+    # Nothing to read where there are no values, and nothing to raise in a compiled graph.
+    if (
+        not torch.compiler.is_compiling()
+        and has_values(weights)
+        and not bool((weights.isfinite() & (weights >= 0.0)).all())
+    ):
+        raise ValueError("expected finite mask values of 0 or more, got others; clamp the mask")
     return (plane * weights).sum((1, 2, 3)) / weights.sum((1, 2, 3)).clamp_min(
         torch.finfo(plane.dtype).tiny
     )

@@ -5,6 +5,7 @@ from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
+from torch._subclasses.fake_tensor import is_fake
 from torch.utils.checkpoint import checkpoint
 
 from torch_vdm.display import Display
@@ -170,7 +171,7 @@ class PairMetric(nn.Module):
         )
         if self.nonfinite == "mask":
             return finite_in_both(test, reference)
-        if not torch.compiler.is_compiling():
+        if not torch.compiler.is_compiling() and has_values(test):
             _require_finite("test", test, origin)
             _require_finite("reference", reference, origin)
         return test, reference, None
@@ -219,6 +220,11 @@ def _widened(image: Tensor, dtype: torch.dtype) -> Tensor:
 def masked(plane: Tensor, seen: Tensor | None) -> Tensor:
     """Return a plane with 0 where a mask (B, 1, H, W) is not set."""
     return plane if seen is None else torch.where(seen, plane, 0.0)
+
+
+def has_values(image: Tensor) -> bool:
+    """Return whether there is anything to read: not in a meta or a fake tensor."""
+    return not (image.is_meta or is_fake(image))
 
 
 def _require_finite(name: str, image: Tensor, origin: tuple[int, int, int]) -> None:

@@ -1,0 +1,56 @@
+"""What tensors without values tell: no read-back from a device, and no device left behind."""
+
+import pytest
+import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from torch_vdm import VDM, Haar, Observer, StationaryHaar, Steerable, VDMLoss
+from torch_vdm.cortex import Transform
+
+each_transform = pytest.mark.parametrize(
+    "transform", [Haar(), StationaryHaar(), Steerable()], ids=lambda t: type(t).__name__
+)
+
+
+@each_transform
+@pytest.mark.parametrize("observer", [Observer.calibrated(), Observer.paper()])
+def test_nothing_is_read_back_from_the_device(transform: Transform, observer: Observer) -> None:
+    # A fake tensor has no values: to ask for one raises.
+    with FakeTensorMode():
+        metric = VDM(transform=transform, observer=observer, nonfinite="mask")
+        loss = VDMLoss(transform=transform, observer=observer, nonfinite="mask")
+        test = torch.rand(2, 3, 21, 34, requires_grad=True)
+        reference = torch.rand(2, 3, 21, 34)
+        with pytest.raises(Exception, match="_local_scalar_dense"):
+            bool(test.sum() > 0.0)
+        assert metric(test, reference).shape == (2, 1, 21, 34)
+        assert metric.score(test, reference).shape == (2,)
+        value = loss(test, reference, torch.ones(2, 1, 21, 34))
+        (gradient,) = torch.autograd.grad(value, test)
+        assert gradient.shape == test.shape
+        # What is left to "raise" is the one check of each image, which these have no values for.
+        assert VDM(transform=transform, observer=observer)(test, reference).shape == (2, 1, 21, 34)
+
+
+def test_nothing_is_read_back_by_sarnoffs_model() -> None:
+    with FakeTensorMode():
+        image = torch.rand(1, 3, 20, 30)
+        assert VDM.sarnoff(30.0)(image, image.flip(-1)).shape == (1, 1, 20, 30)
+
+
+@each_transform
+def test_a_meta_call_gives_the_shape(transform: Transform) -> None:
+    image = torch.empty(2, 3, 9, 14, device="meta")
+    jnd = VDM(transform=transform).to("meta")(image, image)
+    assert jnd.shape == (2, 1, 9, 14)
+    assert jnd.is_meta
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@each_transform
+def test_a_gpu_gives_what_the_processor_gives(transform: Transform) -> None:
+    test, reference = torch.rand(2, 2, 3, 40, 70, dtype=torch.float64)
+    metric = VDM(transform=transform)
+    expected = metric(test, reference)
+    actual = metric.cuda()(test.cuda(), reference.cuda())
+    torch.testing.assert_close(actual.cpu(), expected, rtol=1e-9, atol=1e-9)
