@@ -1,20 +1,25 @@
 """Whether hard images stay finite, and how much half and single precision cost.
 
-Every case is run in every precision, for both observers and every choice of effects; a cell is the
-largest error of the map against float64 on the same rounded input, relative to 1 JND or to the
-map's maximum, whichever is larger. Map, loss and first gradients of both must be finite in all.
+Every case is run in every precision, for both observers with every choice of effects, for the other
+transforms with all effects and with none, and for Sarnoff's model; a cell is the largest error of
+the map against float64 on the same rounded input, relative to 1 JND or to the map's maximum,
+whichever is larger. Map, loss and first gradients of both must be finite in all. float64 itself is
+held to 50 digits, see `benchmarks.exact`.
 """
 
+import contextlib
 import itertools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from benchmarks.exact import DIGITS, largest_error
 from benchmarks.record import caption, circumstances, save
-from torch_vdm import VDM, Display, Effects, Observer, VDMLoss
+from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar, Steerable, VDMLoss
+from torch_vdm.cortex import Transform
 
 SIZE = (24, 31)
 DTYPES = {
@@ -22,6 +27,7 @@ DTYPES = {
     "float32": torch.float32,
     "bfloat16": torch.bfloat16,
     "float16": torch.float16,
+    "autocast": torch.float32,
 }
 OBSERVERS = (Observer.calibrated(), Observer.paper())
 EFFECTS = [Effects(*switches) for switches in itertools.product((True, False), repeat=4)]
@@ -30,16 +36,16 @@ Pair = tuple[Tensor, Tensor]
 
 def run(quick: bool, output: Path | None) -> None:
     """Measure, print the table, and write stability.json, .md and .png to ``output``."""
-    effects = EFFECTS[:1] + EFFECTS[-1:] if quick else EFFECTS
+    models = _models(quick)
     result: dict[str, Any] = {
         **circumstances(),
         "size": SIZE,
-        "observers": [observer.name for observer in OBSERVERS],
-        "choices_of_effects": len(effects),
+        "models": [model.name for model in models],
         "cases": {
-            name: {precision: _cell(*make(), dtype, effects) for precision, dtype in DTYPES.items()}
+            name: {precision: _cell(*make(), precision, models) for precision in DTYPES}
             for name, make in CASES.items()
         },
+        "digits": {observer.name: largest_error(observer) for observer in OBSERVERS},
     }
     result["not_finite"] = [
         f"{name} in {precision}: {what}"
@@ -107,31 +113,64 @@ CASES: dict[str, Callable[[], Pair]] = {
 }
 
 
-def _cell(test: Tensor, reference: Tensor, dtype: torch.dtype, effects: list[Effects]) -> Any:
-    """Return the largest error of the map over observers and effects, and what is not finite."""
+class Model(NamedTuple):
+    """A metric and, where there is one, its loss."""
+
+    name: str
+    metric: nn.Module
+    loss: nn.Module | None
+
+
+def _models(quick: bool) -> list[Model]:
+    """Return everything that is run."""
+    few = [EFFECTS[0], EFFECTS[-1]]
+    choices: list[tuple[Transform, list[Effects]]] = [
+        (Haar(), few if quick else EFFECTS),
+        (StationaryHaar(), few),
+        (Steerable(), few),
+    ]
+    models = []
+    for observer, (transform, effects) in itertools.product(OBSERVERS, choices):
+        for choice in effects:
+            options: dict[str, Any] = {
+                "display": Display.xyz(), "observer": observer, "transform": transform,
+                "effects": choice,
+            }  # fmt: skip
+            words = type(transform).__name__, observer.name, "+".join(choice.names()) or "none"
+            models.append(Model(", ".join(words), VDM(**options), VDMLoss(**options)))
+    return [*models, Model("Sarnoff", VDM.sarnoff(display=Display.xyz()), None)]
+
+
+def _cell(test: Tensor, reference: Tensor, precision: str, models: list[Model]) -> Any:
+    """Return the largest error of the map over the models, and what is not finite."""
+    dtype = DTYPES[precision]
     largest = torch.finfo(dtype).max
     test, reference = (image.clamp(-largest, largest).to(dtype) for image in (test, reference))
     worst = 0.0
     bad: list[str] = []
-    for observer, choice in itertools.product(OBSERVERS, effects):
-        options: dict[str, Any] = {
-            "display": Display.xyz(), "observer": observer, "effects": choice,
-        }  # fmt: skip
-        metric = VDM(**options)
-        loss = VDMLoss(**options)
+    for model in models:
         image = test.clone().requires_grad_()
-        jnd, value = metric(image, reference), loss(image, reference)
-        (of_map,) = torch.autograd.grad(jnd.sum(), image)
-        (of_loss,) = torch.autograd.grad(value, image)
-        for what, tensor in (
-            ("map", jnd), ("loss", value), ("map's gradient", of_map), ("loss's gradient", of_loss),
-        ):  # fmt: skip
-            if not bool(torch.isfinite(tensor).all()):
-                bad.append(f"{what}, {observer.name}, {'+'.join(choice.names()) or 'no effects'}")
-        exact = metric(test.double(), reference.double())
+        mixed = torch.autocast("cpu", torch.bfloat16)
+        with mixed if precision == "autocast" else contextlib.nullcontext():
+            jnd = model.metric(image, reference)
+            found = {"map": jnd, "map's gradient": _gradient(jnd.sum(), image)}
+            if model.loss is not None:
+                value = model.loss(image, reference)
+                found |= {"loss": value, "loss's gradient": _gradient(value, image)}
+        bad += [
+            f"{what}, {model.name}"
+            for what, tensor in found.items()
+            if not bool(torch.isfinite(tensor).all())
+        ]
+        exact = model.metric(test.double(), reference.double())
         error = (jnd.detach().double() - exact).abs().max() / exact.max().clamp_min(1.0)
         worst = max(worst, error.item())
     return {"error": worst, "not_finite": bad}
+
+
+def _gradient(value: Tensor, image: Tensor) -> Tensor:
+    (gradient,) = torch.autograd.grad(value, image)
+    return gradient
 
 
 def _table(result: dict[str, Any]) -> str:
@@ -141,8 +180,9 @@ def _table(result: dict[str, Any]) -> str:
         caption(result),
         "",
         f"Largest error of the map against float64, relative to its maximum or 1 JND, over "
-        f"{len(result['observers'])} observers and {result['choices_of_effects']} choices of "
-        "effects; the inputs are rounded to the precision first. Map, loss and the gradients of "
+        f"{len(result['models'])} models: both observers with every choice of effects, the other "
+        "transforms with all effects and with none, and Sarnoff's model. The inputs are rounded to "
+        "the precision first; under autocast they are float32. Map, loss and the gradients of "
         f"both: {len(result['not_finite'])} cells are not finite.",
         "",
         "| absolute XYZ | " + " | ".join(DTYPES) + " |",
@@ -154,6 +194,12 @@ def _table(result: dict[str, Any]) -> str:
             for cell in cells.values()
         ]
         lines.append(f"| {name} | " + " | ".join(shown) + " |")
+    digits = ", ".join(f"{name} {error:.0e}" for name, error in result["digits"].items())
+    lines += [
+        "",
+        f"float64 against {DIGITS} digits, one coefficient from light to JND (`benchmarks.exact`), "
+        f"largest relative error: {digits}.",
+    ]
     return "\n".join(lines) + "\n"
 
 

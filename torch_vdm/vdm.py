@@ -38,6 +38,10 @@ from torch_vdm.tiled import TiledMetric
 # Planes with more numbers are computed in parts. Status: choice, measured.
 LARGEST_AT_ONCE = 2**20
 
+# What a difference counts for in the detection score at most, so that its fourth power, summed,
+# stays finite in float32. Status: choice; light stays far below.
+LARGEST_SCORED = 1e8
+
 
 # A Butterworth filter's parameters.
 FILTER = ("gain", "cutoff", "order")
@@ -187,10 +191,11 @@ class VDM(TiledMetric):
         dtype = first.lowpass[0].dtype
         constants = self._constants(dtype, "score_exponent", "score_coefficients")
         exponent = constants["score_exponent"]
-        root = self.lowpass_difference(first, second) ** exponent
+        lowpass = self.lowpass_difference(first, second).clamp_max(LARGEST_SCORED)
+        root = lowpass**exponent
         glances = [
             glance(
-                self._scored(seen - expected, exponent),
+                self._scored((seen - expected).clamp(-LARGEST_SCORED, LARGEST_SCORED), exponent),
                 self.observer.score_window,
                 self.transform.shifts,
             )
