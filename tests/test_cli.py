@@ -281,6 +281,13 @@ def test_an_unknown_accuracy_is_refused(pair: Pair, capsys: pytest.CaptureFixtur
     assert "reference" in told
 
 
+def test_a_negative_number_may_have_an_exponent(
+    pair: Pair, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, other = (run_json(capsys, *pair, "--exposure", text) for text in ("-1e-1", "-0.1"))
+    assert one["max_jnd"] == other["max_jnd"]
+
+
 def test_tiles_give_the_same_figures(
     pair: Pair, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

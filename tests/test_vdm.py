@@ -230,6 +230,21 @@ def test_wrong_options_are_refused(arguments: dict[str, object], message: str) -
         VDM(**arguments)  # type: ignore[arg-type]  # wrong on purpose
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"dark_light": 0.0}, "dark_light: a finite number over 0, got 0"),
+        ({"band_width": float("nan")}, "band_width: a finite number over 0, got nan"),
+        ({"red_green_gain": -1.0}, "red_green_gain: a finite number from 0, got -1"),
+        ({"lowpass_gains": (1.0, 2.0)}, "lowpass_gains: three or None"),
+        ({"score_window": 4}, "score_window: an odd number, got 4"),
+    ],
+)
+def test_wrong_observers_are_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(Observer.calibrated(), **changes)  # type: ignore[arg-type]  # wrong on purpose
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_nonfinite_pixels_are_named_or_masked(value: float) -> None:
     test, reference = images(3)

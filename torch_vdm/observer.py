@@ -1,7 +1,24 @@
 """Who looks: the parameters of the vision model."""
 
+import math
 from dataclasses import dataclass, fields
 from typing import Self
+
+# What is divided by, or is a root or a filter's place: never 0.
+POSITIVE = (
+    "dark_light",
+    "aberration_cutoff",
+    "adaptation_luminance",
+    "achromatic_size",
+    "glare_luminance",
+    "peak_frequency",
+    "band_width",
+    "red_green_cutoff",
+    "yellow_violet_cutoff",
+    "summation_exponent",
+    "score_exponent",
+    "score_coefficients",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +106,20 @@ class Observer:
     score_exponent: float
     score_coefficients: float
     score_window: int
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that no observer has."""
+        numbers = self.numbers()
+        gains = self.lowpass_gains or ()
+        if len(gains) not in (0, 3):
+            raise ValueError(f"expected lowpass_gains: three or None, got {gains}")
+        numbers |= {f"lowpass_gains[{place}]": gain for place, gain in enumerate(gains)}
+        for name, value in numbers.items():
+            if not math.isfinite(value) or value < 0.0 or (name in POSITIVE and value == 0.0):
+                least = "a finite number over 0" if name in POSITIVE else "a finite number from 0"
+                raise ValueError(f"expected {name}: {least}, got {value}")
+        if self.score_window % 2 != 1:
+            raise ValueError(f"expected score_window: an odd number, got {self.score_window}")
 
     @classmethod
     def paper(cls) -> Self:
