@@ -1,6 +1,7 @@
 """The visual difference metric: the stages of Fig. 2, in order. Only this file knows the order."""
 
 import math
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, Self
 
 import torch
@@ -37,6 +38,10 @@ from torch_vdm.sarnoff import Sarnoff
 # Planes with more numbers are computed in parts. Status: choice, measured.
 LARGEST_AT_ONCE = 2**20
 
+# Levels of at most as many nodes are computed at once: there an operation costs more than the
+# numbers that it works on. Status: choice, measured.
+FEW_NODES = 64 * 64
+
 
 # A Butterworth filter's parameters.
 FILTER = ("gain", "cutoff", "order")
@@ -45,18 +50,43 @@ FILTER = ("gain", "cutoff", "order")
 class Level(NamedTuple):
     """What a level of the transform responds to, as far as it does not depend on the image.
 
-    Where there are as many as orientations, one stands for all where all have the same.
+    For planes (h, w) of one level the last two sides are 1 and 1; for the nodes of several levels
+    in a row, they are 1 and as many. Where there are as many as orientations, one stands for all
+    where all have the same.
     """
 
     passed: Tensor
-    """(3,): the share of each cone's details that chromatic aberration leaves."""
+    """(3, 1, 1): the share of each cone's details that chromatic aberration leaves."""
     frequency: Tensor
-    """As many, in cycles/degree: the frequency of the best response."""
+    """(as many, 1, 1), in cycles/degree: the frequency of the best response."""
     gain: Tensor
-    """As many: what contrast is divided by."""
+    """(as many, 1, 1): what contrast is divided by."""
     sensitivity: Tensor
-    """(channels, as many): the contrast sensitivity, over the gain. Where the luminance is local,
-    that of C1 and C2 in bright light."""
+    """(channels, as many, 1, 1): the contrast sensitivity, over the gain. Where the luminance is
+    local, that of C1 and C2 in bright light."""
+
+
+class Sight(NamedTuple):
+    """What turns the details of an image at a level into contrasts and weights them."""
+
+    scale: Tensor
+    """(B, 3, h, w): for each cone the share that chromatic aberration leaves, over what the
+    parent is adapted to."""
+    sensitivity: Tensor
+    """(B, channels, orientations, h, w): the contrast sensitivity of each channel, or one
+    orientation or node of it where all have the same."""
+
+    def pushed(self, size: tuple[int, int]) -> "Sight":
+        """Return what is given at the parents at their children, on a plane of ``size``."""
+        shared = self.sensitivity.shape[-2:] == (1, 1)
+        sensitivity = self.sensitivity if shared else push(self.sensitivity, size)
+        return Sight(push(self.scale, size), sensitivity)
+
+    def of(self, orientations: slice) -> "Sight":
+        """Return the sight of some orientations."""
+        if self.sensitivity.shape[2] == 1:
+            return self
+        return Sight(self.scale, self.sensitivity[:, :, orientations])
 
 
 class VDM(PairMetric):
@@ -217,20 +247,14 @@ class VDM(PairMetric):
         One (B, channels, orientations, h, w) a level, level 0 first; 1 is threshold.
         """
         constants = self._constants(cortex.lowpass[0].dtype)
-        return tuple(
-            _response(
-                detail,
-                *self._sight(cortex, number, level, constants),
-                constants["opponents"],
-                constants["transducer_exponent"],
-                self.observer.signed,
-                self.effects.masking,
-                self.transform.phases,
+        responses = []
+        for number, level in enumerate(self._levels(cortex, constants)):
+            detail = cortex.details[number]
+            (sight,) = self._sights(level, constants, [cortex.parent_lowpass(number)])
+            responses.append(
+                _response(detail, sight.pushed(_size(detail)), *self._options(constants))
             )
-            for number, (detail, level) in enumerate(
-                zip(cortex.details, self._levels(cortex, constants), strict=True)
-            )
-        )
+        return tuple(responses)
 
     def lowpass_difference(self, first: Cortex, second: Cortex) -> Tensor:
         """Return the weighted contrast between the means of two images, the lowpass term.
@@ -263,10 +287,38 @@ class VDM(PairMetric):
         One (B, 1, h, w) a level, level 0 first.
         """
         constants = self._constants(first.lowpass[0].dtype)
-        return tuple(
-            self._local_difference(first, second, number, level, constants)
-            for number, level in enumerate(self._levels(first, constants))
+        levels = self._levels(first, constants)
+        few = sum(math.prod(_size(detail)) <= FEW_NODES for detail in first.details)
+        return (
+            *self._local_differences_of_few(first, second, levels[:few], constants),
+            *(
+                self._local_difference(first, second, number, levels[number], constants)
+                for number in range(few, len(levels))
+            ),
         )
+
+    def _local_differences_of_few(
+        self, first: Cortex, second: Cortex, levels: list[Level], constants: dict[str, Tensor]
+    ) -> list[Tensor]:
+        """Return the local visual differences of the coarsest levels, their nodes in a row."""
+        if not levels:
+            return []
+        sizes = [_size(detail) for detail in first.details[: len(levels)]]
+        details, parents = [], []
+        for cortex in (first, second):
+            details.append(_in_a_row(cortex.details[: len(levels)]))
+            lowpass = (cortex.parent_lowpass(number) for number in range(len(levels)))
+            pushed = [push(plane, size) for plane, size in zip(lowpass, sizes, strict=True)]
+            parents.append(_in_a_row(pushed))
+        nodes = [math.prod(size) for size in sizes]
+        level = _levels_in_a_row(levels, nodes)
+        difference = _response_difference(
+            *details, *self._sights(level, constants, parents), *self._options(constants)
+        )
+        return [
+            self._gathered(part.unflatten(-1, size).squeeze(-3), constants["summation_exponent"])
+            for part, size in zip(difference.split(nodes, -1), sizes, strict=True)
+        ]
 
     def _local_difference(
         self,
@@ -277,36 +329,44 @@ class VDM(PairMetric):
         constants: dict[str, Tensor],
     ) -> Tensor:
         """Return the local visual difference (B, 1, h, w) of one level."""
-        one, other = first.details[number], second.details[number]
-        scale, sensitivity = self._sight(first, number, level, constants)
-        other_scale, other_sensitivity = self._sight(second, number, level, constants)
-        phases = self.transform.phases
-        fast = self._fast and one.numel() >= SMALLEST
+        details = first.details[number], second.details[number]
+        parents = [cortex.parent_lowpass(number) for cortex in (first, second)]
+        sights = [
+            sight.pushed(_size(details[0])) for sight in self._sights(level, constants, parents)
+        ]
+        orientations = details[0].shape[2]
+        fast = self._is_fast(details[0])
         respond = compiled(_response_difference) if fast else _response_difference
         # One orientation at a time where the planes are large: what is computed on the way then
         # stays in the processor's cache. Compiled code keeps nothing on the way.
-        at_once = one.shape[2] if fast or one.numel() <= LARGEST_AT_ONCE else phases
+        small = fast or details[0].numel() <= LARGEST_AT_ONCE
+        at_once = orientations if small else self.transform.phases
         local = []
-        for plane in range(0, one.shape[2], at_once):
+        for plane in range(0, orientations, at_once):
             some = slice(plane, plane + at_once)
-            same = some if sensitivity.shape[2] > 1 else slice(None)
             difference = respond(
-                one[:, :, some],
-                other[:, :, some],
-                scale,
-                sensitivity[:, :, same],
-                other_scale,
-                other_sensitivity[:, :, same],
-                constants["opponents"],
-                constants["transducer_exponent"],
-                self.observer.signed,
-                self.effects.masking,
-                phases,
+                *(detail[:, :, some] for detail in details),
+                *(sight.of(some) for sight in sights),
+                *self._options(constants),
             )
             local.append(self._gathered(difference, constants["summation_exponent"], fast))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]
 
-    def _gathered(self, difference: Tensor, exponent: Tensor, fast: bool) -> Tensor:
+    def _options(self, constants: dict[str, Tensor]) -> tuple[Tensor, Tensor, bool, bool, int]:
+        """Return what `_response` takes beside details and sight."""
+        return (
+            constants["opponents"],
+            constants["transducer_exponent"],
+            self.observer.signed,
+            self.effects.masking,
+            self.transform.phases,
+        )
+
+    def _is_fast(self, plane: Tensor) -> bool:
+        """Return whether compiled code pays for a plane of this size."""
+        return self._fast and plane.numel() >= SMALLEST
+
+    def _gathered(self, difference: Tensor, exponent: Tensor, fast: bool = False) -> Tensor:
         """Return the local visual difference of response differences, after spatial pooling."""
         if self.transform.shifts == 1:
             if not self.effects.pooling:
@@ -322,25 +382,13 @@ class VDM(PairMetric):
         local = columns(rows(surrounded, nodes, -1), nodes, exponent)
         return local  # noqa: RET504  # for its type
 
-    def _sight(
-        self, cortex: Cortex, number: int, level: Level, constants: dict[str, Tensor]
-    ) -> tuple[Tensor, Tensor]:
-        """Return what turns a level's details into contrasts and weights them.
-
-        For each cone (B, 3, h, w): the share that chromatic aberration leaves, over the parent's
-        adaptation; scaled at the parents, of which there are fewer. For each channel the contrast
-        sensitivity, (B, channels, orientations, h, w), or one orientation or node of it where all
-        have the same.
-        """
-        parent = cortex.parent_lowpass(number)
-        size = (cortex.details[number].shape[-2], cortex.details[number].shape[-1])
-        fast = self._fast and parent.numel() >= SMALLEST
-        scaled = compiled(_scale) if fast else _scale
-        scale = push(scaled(parent, level.passed, constants["dark_cones"]), size)
-        if self.observer.adaptation_luminance is not None:
-            return scale, level.sensitivity[None, ..., None, None]
-        sensed = compiled(_sensitivity) if fast else _sensitivity
-        return scale, push(sensed(parent, level, constants, self.effects.chromatic), size)
+    def _sights(
+        self, level: Level, constants: dict[str, Tensor], parents: Sequence[Tensor]
+    ) -> list["Sight"]:
+        """Return for each image, given the lowpass of the parents, the sight of a level there."""
+        look = compiled(_sight) if self._is_fast(parents[0]) else _sight
+        local = self.observer.adaptation_luminance is None
+        return [look(parent, level, constants, local, self.effects.chromatic) for parent in parents]
 
     def _levels(self, cortex: Cortex, constants: dict[str, Tensor]) -> list[Level]:
         """Return what each level of ``cortex`` responds to, level 0 (the coarsest) first.
@@ -368,8 +416,31 @@ class VDM(PairMetric):
             ]
         bright = torch.stack(channels, 1) / gain.unsqueeze(1) if channels else gain.unsqueeze(1)
         # Copies, for compiled code is specialised on the offset of a view.
-        columns = [[row.clone() for row in part] for part in (passed, frequency, gain, bright)]
+        columns = (
+            [row[..., None, None].clone() for row in part]
+            for part in (passed, frequency, gain, bright)
+        )
         return [Level(*row) for row in zip(*columns, strict=True)]
+
+
+def _size(plane: Tensor) -> tuple[int, int]:
+    return plane.shape[-2], plane.shape[-1]
+
+
+def _in_a_row(planes: Iterable[Tensor]) -> Tensor:
+    """Return the nodes of planes (..., h, w) in a row, (..., 1, all of them)."""
+    return torch.cat([plane.flatten(-2) for plane in planes], -1).unsqueeze(-2)
+
+
+def _levels_in_a_row(levels: Sequence[Level], nodes: Sequence[int]) -> Level:
+    """Return several levels as one, whose planes are the ``nodes`` of each in a row."""
+    device = levels[0].passed.device
+    count = torch.tensor(nodes, device=device)
+    # For each node its level; the size is given so that nothing is read back from the device.
+    which = torch.repeat_interleave(
+        torch.arange(len(nodes), device=device), count, output_size=sum(nodes)
+    )
+    return Level(*(torch.cat(part, -1)[..., which] for part in zip(*levels, strict=True)))
 
 
 def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) -> Tensor:
@@ -379,8 +450,7 @@ def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) ->
 
 def _response(
     details: Tensor,
-    scale: Tensor,
-    sensitivity: Tensor,
+    sight: Sight,
     matrix: Tensor,
     exponent: Tensor,
     signed: bool,
@@ -388,8 +458,8 @@ def _response(
     phases: int,
 ) -> Tensor:
     """Return the responses of one level of one image: local contrast to the transducer."""
-    contrast = opponents(local_contrast(details, scale), matrix)
-    weighted = contrast * sensitivity
+    contrast = opponents(local_contrast(details, sight.scale), matrix)
+    weighted = contrast * sight.sensitivity
     if signed:
         return signed_transducer(weighted, exponent, phases) if masking else weighted
     return energy_transducer(weighted * weighted) if masking else weighted.abs()
@@ -398,10 +468,8 @@ def _response(
 def _response_difference(
     details: Tensor,
     other_details: Tensor,
-    scale: Tensor,
-    sensitivity: Tensor,
-    other_scale: Tensor,
-    other_sensitivity: Tensor,
+    sight: Sight,
+    other_sight: Sight,
     matrix: Tensor,
     exponent: Tensor,
     signed: bool,
@@ -413,16 +481,24 @@ def _response_difference(
     Each image by itself: equal images then take equal paths through the vectorised loops, and
     their difference is exactly 0.
     """
-    response = _response(details, scale, sensitivity, matrix, exponent, signed, masking, phases)
-    other = _response(
-        other_details, other_scale, other_sensitivity, matrix, exponent, signed, masking, phases
+    options = matrix, exponent, signed, masking, phases
+    difference = _response(details, sight, *options) - _response(
+        other_details, other_sight, *options
     )
-    return (response - other).abs() if signed else response - other
+    return difference.abs() if signed else difference
 
 
-def _scale(parent: Tensor, passed: Tensor, dark_cones: Tensor) -> Tensor:
-    """Return what turns details into contrasts, at their parents."""
-    return passed.view(3, 1, 1) / adapted(parent, dark_cones)
+def _sight(
+    parent: Tensor, level: Level, constants: dict[str, Tensor], local: bool, chromatic: bool
+) -> Sight:
+    """Return the sight of a level at its parents, of which there are fewer than nodes.
+
+    ``parent`` is their lowpass (B, 3, h, w); ``local``: in the local luminance.
+    """
+    scale = level.passed / adapted(parent, constants["dark_cones"])
+    if not local:
+        return Sight(scale, level.sensitivity.unsqueeze(0))
+    return Sight(scale, _sensitivity(parent, level, constants, chromatic))
 
 
 def _sensitivity(
@@ -434,16 +510,16 @@ def _sensitivity(
     dark = torch.log2(1.0 + constants["dim_luminance"] / luminance)
     glare = torch.log2(1.0 + luminance / constants["glare_luminance"])
     faint = torch.log2(1.0 + constants["peak_luminance"] / luminance)
-    relative = torch.log2(level.frequency / constants["peak_frequency"]).view(-1, 1, 1)
+    relative = torch.log2(level.frequency / constants["peak_frequency"])
     octaves = relative + constants["peak_exponent"] * faint
     dimmed = constants["achromatic_dimming"] * dark + constants["glare_exponent"] * glare
     shape = bandpass(octaves, constants["band_width"], constants["band_floor"])
-    gain = constants["achromatic_gain"] / level.gain.view(-1, 1, 1)
+    gain = constants["achromatic_gain"] / level.gain
     achromatic = gain * shape * torch.exp2(-dimmed)
     if not chromatic:
         return achromatic
     dim = torch.exp2(-constants["chromatic_dimming"] * dark)
-    return torch.cat((achromatic, level.sensitivity[..., None, None] * dim), 1)
+    return torch.cat((achromatic, level.sensitivity * dim), 1)
 
 
 def _pooled_energy(surrounded: Tensor, nodes: int, exponent: Tensor) -> Tensor:
