@@ -304,16 +304,16 @@ class VDM(PairMetric):
         if not levels:
             return []
         sizes = [_size(detail) for detail in first.details[: len(levels)]]
+        nodes = [math.prod(size) for size in sizes]
         details, parents = [], []
         for cortex in (first, second):
             details.append(_in_a_row(cortex.details[: len(levels)]))
             lowpass = (cortex.parent_lowpass(number) for number in range(len(levels)))
             pushed = [push(plane, size) for plane, size in zip(lowpass, sizes, strict=True)]
             parents.append(_in_a_row(pushed))
-        nodes = [math.prod(size) for size in sizes]
-        level = _levels_in_a_row(levels, nodes)
+        sights = self._sights(_levels_in_a_row(levels, nodes), constants, parents)
         difference = _response_difference(
-            *details, *self._sights(level, constants, parents), *self._options(constants)
+            details[0], details[1], sights[0], sights[1], *self._options(constants)
         )
         return [
             self._gathered(part.unflatten(-1, size).squeeze(-3), constants["summation_exponent"])
@@ -329,24 +329,27 @@ class VDM(PairMetric):
         constants: dict[str, Tensor],
     ) -> Tensor:
         """Return the local visual difference (B, 1, h, w) of one level."""
-        details = first.details[number], second.details[number]
+        details, others = first.details[number], second.details[number]
         parents = [cortex.parent_lowpass(number) for cortex in (first, second)]
-        sights = [
-            sight.pushed(_size(details[0])) for sight in self._sights(level, constants, parents)
-        ]
-        orientations = details[0].shape[2]
-        fast = self._is_fast(details[0])
+        fast = self._fast and details.numel() >= SMALLEST
+        sight, other_sight = (
+            sight.pushed(_size(details)) for sight in self._sights(level, constants, parents, fast)
+        )
+        orientations = details.shape[2]
         respond = compiled(_response_difference) if fast else _response_difference
         # One orientation at a time where the planes are large: what is computed on the way then
         # stays in the processor's cache. Compiled code keeps nothing on the way.
-        small = fast or details[0].numel() <= LARGEST_AT_ONCE
-        at_once = orientations if small else self.transform.phases
+        at_once = orientations
+        if not fast and details.numel() > LARGEST_AT_ONCE:
+            at_once = self.transform.phases
         local = []
         for plane in range(0, orientations, at_once):
             some = slice(plane, plane + at_once)
             difference = respond(
-                *(detail[:, :, some] for detail in details),
-                *(sight.of(some) for sight in sights),
+                details[:, :, some],
+                others[:, :, some],
+                sight.of(some),
+                other_sight.of(some),
                 *self._options(constants),
             )
             local.append(self._gathered(difference, constants["summation_exponent"], fast))
@@ -361,10 +364,6 @@ class VDM(PairMetric):
             self.effects.masking,
             self.transform.phases,
         )
-
-    def _is_fast(self, plane: Tensor) -> bool:
-        """Return whether compiled code pays for a plane of this size."""
-        return self._fast and plane.numel() >= SMALLEST
 
     def _gathered(self, difference: Tensor, exponent: Tensor, fast: bool = False) -> Tensor:
         """Return the local visual difference of response differences, after spatial pooling."""
@@ -383,10 +382,14 @@ class VDM(PairMetric):
         return local  # noqa: RET504  # for its type
 
     def _sights(
-        self, level: Level, constants: dict[str, Tensor], parents: Sequence[Tensor]
-    ) -> list["Sight"]:
-        """Return for each image, given the lowpass of the parents, the sight of a level there."""
-        look = compiled(_sight) if self._is_fast(parents[0]) else _sight
+        self,
+        level: Level,
+        constants: dict[str, Tensor],
+        parents: Sequence[Tensor],
+        fast: bool = False,
+    ) -> list[Sight]:
+        """Return the sight of a level for each image, at the parents, whose lowpass is given."""
+        look = compiled(_sight) if fast else _sight
         local = self.observer.adaptation_luminance is None
         return [look(parent, level, constants, local, self.effects.chromatic) for parent in parents]
 
