@@ -28,7 +28,7 @@ from torch_vdm.distance import (
 from torch_vdm.effects import Effects
 from torch_vdm.fast import SMALLEST, compiled
 from torch_vdm.masking import energy_transducer, signed_transducer
-from torch_vdm.matrix import mix
+from torch_vdm.matrix import mix, product
 from torch_vdm.observer import Observer
 from torch_vdm.pair import Nonfinite, PairMetric
 from torch_vdm.pooling import glance, phase_energy, pool, pool_halves, surround, surround_halves
@@ -448,7 +448,10 @@ def _levels_in_a_row(levels: Sequence[Level], nodes: Sequence[int]) -> Level:
 
 def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) -> Tensor:
     """Return the cone responses (B, 3, H, W) to an image on a display."""
-    return cone_responses(display.to_xyz(image, primaries), cones)
+    if display.encoding == "xyz":
+        return cone_responses(display.to_xyz(image, primaries), cones)
+    # From the display's primaries to cones at once: one mixing of all pixels instead of two.
+    return display.to_xyz(image, product(cones, primaries))
 
 
 def _response(
