@@ -36,7 +36,7 @@ from torch_vdm.quadtree import push
 from torch_vdm.sarnoff import Sarnoff
 
 # Planes with more numbers are computed in parts. Status: choice, measured.
-LARGEST_AT_ONCE = 2**20
+LARGEST_AT_ONCE = 2**18
 
 # Levels of at most as many nodes are computed at once: there an operation costs more than the
 # numbers that it works on. Status: choice, measured.
