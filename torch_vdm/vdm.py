@@ -30,10 +30,11 @@ from torch_vdm.fast import SMALLEST, compiled
 from torch_vdm.masking import energy_transducer, signed_transducer
 from torch_vdm.matrix import mix, product
 from torch_vdm.observer import Observer
-from torch_vdm.pair import Nonfinite, PairMetric
+from torch_vdm.pair import Nonfinite
 from torch_vdm.pooling import glance, phase_energy, pool, pool_halves, surround, surround_halves
 from torch_vdm.quadtree import push
 from torch_vdm.sarnoff import Sarnoff
+from torch_vdm.tiled import TiledMetric
 
 # Planes with more numbers are computed in parts. Status: choice, measured.
 LARGEST_AT_ONCE = 2**18
@@ -89,7 +90,7 @@ class Sight(NamedTuple):
         return Sight(self.scale, self.sensitivity[:, :, orientations])
 
 
-class VDM(PairMetric):
+class VDM(TiledMetric):
     """The visual difference metric of Bolin and Meyer 1999 as a module.
 
     Calling it with a test and a reference image, both (B, 3, H, W), gives the map of their
@@ -196,22 +197,35 @@ class VDM(PairMetric):
         cycles, where the map stays local.
         """
         test, reference, _ = self._checked(test, reference)
-        constants = self._constants(test.dtype, "score_exponent", "score_coefficients")
-        exponent, coefficients = constants["score_exponent"], constants["score_coefficients"]
-        totals = []
-        for one, other in self._parts(test, reference):
-            first, second = self.represent(one), self.represent(other)
-            root = coefficients * self.lowpass_difference(first, second) ** exponent
-            glances = [
-                glance(
-                    self._scored(seen - expected, exponent),
-                    self.observer.score_window,
-                    self.transform.shifts,
-                )
-                for seen, expected in zip(self.respond(first), self.respond(second), strict=True)
-            ]
-            totals.append(accumulate(glances, root.sum(1, keepdim=True)).amax((1, 2, 3)))
-        return just_noticeable(torch.cat(totals) / coefficients, exponent)
+        totals = [
+            accumulate(*self._glances(self.represent(one), self.represent(other))).amax((1, 2, 3))
+            for one, other in self._parts(test, reference)
+        ]
+        return self._detected(torch.cat(totals))
+
+    def _detected(self, most: Tensor) -> Tensor:
+        """Return the score of what the largest leaf of each item has accumulated, (B,)."""
+        constants = self._constants(most.dtype, "score_exponent", "score_coefficients")
+        return just_noticeable(most / constants["score_coefficients"], constants["score_exponent"])
+
+    def _glances(self, first: Cortex, second: Cortex) -> tuple[list[Tensor], Tensor]:
+        """Return what one glance at each node adds to the score, and what every path begins with.
+
+        One (B, 1, h, w) a level, level 0 first, and (B, 1, 1, 1).
+        """
+        dtype = first.lowpass[0].dtype
+        constants = self._constants(dtype, "score_exponent", "score_coefficients")
+        exponent = constants["score_exponent"]
+        root = self.lowpass_difference(first, second) ** exponent
+        glances = [
+            glance(
+                self._scored(seen - expected, exponent),
+                self.observer.score_window,
+                self.transform.shifts,
+            )
+            for seen, expected in zip(self.respond(first), self.respond(second), strict=True)
+        ]
+        return glances, constants["score_coefficients"] * root.sum(1, keepdim=True)
 
     def _scored(self, difference: Tensor, exponent: Tensor) -> Tensor:
         """Return what each node of a level adds to the sum of the score, (B, 1, h, w)."""
@@ -232,14 +246,18 @@ class VDM(PairMetric):
 
         ``image`` is (B, 3, H, W) in float32 or float64, as the display expects it.
         """
+        planes = self._cone_planes(image)
+        return self.transform.decompose(planes, self._fast, self.observer.true_means)
+
+    def _cone_planes(self, image: Tensor) -> Tensor:
+        """Return the cone responses (B, 3, H, W) to an image: display, cones."""
         constants = self._constants(image.dtype, "primaries", "cones")
         around = self.display, constants["primaries"], constants["cones"]
         if self._fast:
             planes: Tensor = compiled(_light)(image, *around)
-        else:
-            rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
-            planes = torch.cat([_light(part, *around) for part in image.split(rows, -2)], -2)
-        return self.transform.decompose(planes, self._fast, self.observer.true_means)
+            return planes
+        rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
+        return torch.cat([_light(part, *around) for part in image.split(rows, -2)], -2)
 
     def respond(self, cortex: Cortex) -> tuple[Tensor, ...]:
         """Return the responses of one image: chromatic aberration to the transducer.
@@ -276,10 +294,13 @@ class VDM(PairMetric):
         (B, 1, h, w) of the finest level. The responses of a level are taken and dropped one
         level at a time, which bounds memory.
         """
+        return accumulate(*self._differences(first, second))
+
+    def _differences(self, first: Cortex, second: Cortex) -> tuple[tuple[Tensor, ...], Tensor]:
+        """Return what each node adds to the map, and what every path begins with."""
         constants = self._constants(first.lowpass[0].dtype, "summation_exponent")
         root = self.lowpass_difference(first, second) ** constants["summation_exponent"]
-        local = self.local_differences(first, second)
-        return accumulate(local, root.sum(1, keepdim=True))
+        return self.local_differences(first, second), root.sum(1, keepdim=True)
 
     def local_differences(self, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
         """Return the local visual difference of every node (Eq. 5), before the root.
@@ -401,7 +422,8 @@ class VDM(PairMetric):
         count = len(cortex.details)
         if count == 0:
             return []
-        frequency, gain = (constants[name][:count].flip(0) for name in ("frequencies", "gains"))
+        some = slice(cortex.finest, cortex.finest + count)
+        frequency, gain = (constants[name][some].flip(0) for name in ("frequencies", "gains"))
         if self.effects.aberration:
             passed = attenuation(
                 frequency[:, 0], constants["aberration_cutoff"], constants["aberration_exponent"]
