@@ -42,7 +42,7 @@ LARGEST_AT_ONCE = 2**18
 
 # Pixels of a band of a large image, and how many levels, from the finest, are computed in bands.
 # Status: choice, measured.
-BAND, BAND_LEVELS = 2**18, 2
+BAND, BAND_LEVELS = 2**19, 2
 
 # Levels of at most as many nodes are computed at once: there an operation costs more than the
 # numbers that it works on. Status: choice, measured.
