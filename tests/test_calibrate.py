@@ -60,7 +60,7 @@ def test_recovers_the_parameters_of_a_synthetic_observer(seed: int) -> None:
         name: value * math.exp(min(0.3, FREE[name][1]) * rng.uniform(-1.0, 1.0))
         for name, value in centre.items()
     }
-    rows = subset(4)
+    rows = subset(6)
     observer = Observer.calibrated()
     of_true = predicted(Model(observer, rows, DRAWINGS[:1]), true)
     noise = SCATTER * rng.standard_normal(len(rows))

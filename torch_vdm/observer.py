@@ -141,7 +141,7 @@ class Observer:
             name="calibrated",
             signed=True,  # choice: a grating and its negative differ
             true_means=True,  # choice: else one odd pixel outweighs half of the image
-            # cd/m2, choice: thresholds at 0.0002 to 0.002 cd/m2 want 0.00025, within a factor of 1.6
+            # cd/m2, choice: left free, the fit takes 0.00025, within a factor of 1.6; held
             dark_light=0.0003,
             aberration_cutoff=5.24,  # cpd, source: a model of the eye, docs/model.md; held
             aberration_exponent=2.15,
