@@ -17,6 +17,7 @@ from torch_vdm.contrast import (
     weber_contrast,
 )
 from torch_vdm.cortex import DEEPEST, Cortex, Haar, Transform
+from torch_vdm.cortex.transform import mean_of
 from torch_vdm.csf import bandpass, barten, butterworth
 from torch_vdm.display import BT709_TO_XYZ, Display
 from torch_vdm.distance import (
@@ -207,9 +208,9 @@ class VDM(TiledMetric):
         constants = self._constants(test.dtype)
         # For each level, coarser first, what its nodes have in each band.
         fine: list[list[Tensor]] = [[] for _ in range(octaves)]
-        # For each image, the means of nodes of 2^octaves pixels, and the sums of its pixels.
+        # For each image, the means of nodes of 2^octaves pixels, and those of rows.
         means: tuple[list[Tensor], list[Tensor]] = [], []
-        sums: tuple[list[Tensor], list[Tensor]] = [], []
+        means_of_rows: tuple[list[Tensor], list[Tensor]] = [], []
         for band in Tiling.bands(size, BAND, octaves, haar.reach + 1):
             bands: list[Cortex] = []
             for number, image in enumerate((test, reference)):
@@ -217,7 +218,7 @@ class VDM(TiledMetric):
                 # One level more, for the parents of the last.
                 cortex = haar.begin(cones, octaves + 1, *options)
                 means[number].append(cut(cortex.lowpass[1], band.within(2**octaves)))
-                sums[number].append(cut(cones, band.within(1)).sum((-2, -1), keepdim=True))
+                means_of_rows[number].append(cut(cones, band.within(1)).mean(-1, keepdim=True))
                 bands.append(cortex)
             for number, level in enumerate(self._levels(bands[0], constants)):
                 if number > 0:
@@ -225,8 +226,10 @@ class VDM(TiledMetric):
                     node = 2 ** (octaves + 1 - number)
                     fine[number - 1].append(cut(local, band.within(node)))
         first, second = (
-            haar.coarser(torch.cat(parts, -2), octaves, size, _mean(total, size), *options)
-            for parts, total in zip(means, sums, strict=True)
+            haar.coarser(
+                torch.cat(parts, -2), octaves, size, mean_of(torch.cat(rows, -2)), *options
+            )
+            for parts, rows in zip(means, means_of_rows, strict=True)
         )
         coarse, root = self._differences(first, second)
         return accumulate([*coarse, *(torch.cat(planes, -2) for planes in fine)], root)
@@ -303,7 +306,7 @@ class VDM(TiledMetric):
             planes: Tensor = compiled(_light)(image, *around)
             return planes
         rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
-        return torch.cat([_light(part, *around) for part in image.split(rows, -2)], -2)
+        return torch.cat([self._kept(_light, part, *around) for part in image.split(rows, -2)], -2)
 
     def respond(self, cortex: Cortex) -> tuple[Tensor, ...]:
         """Return the responses of one image: chromatic aberration to the transducer.
@@ -412,14 +415,19 @@ class VDM(TiledMetric):
         local = []
         for plane in range(0, orientations, at_once):
             some = slice(plane, plane + at_once)
-            difference = respond(
+            arguments = (
                 details[:, :, some],
                 others[:, :, some],
                 sight.of(some),
                 other_sight.of(some),
                 *self._options(constants),
             )
-            local.append(self._gathered(difference, constants["summation_exponent"], fast))
+
+            def gathered(*arguments: Any) -> Tensor:
+                difference = respond(*arguments)
+                return self._gathered(difference, constants["summation_exponent"], fast)
+
+            local.append(self._kept(gathered, *arguments))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]
 
     def _options(self, constants: dict[str, Tensor]) -> tuple[Tensor, Tensor, bool, bool, int]:
@@ -492,11 +500,6 @@ class VDM(TiledMetric):
             for part in (passed, frequency, gain, bright)
         )
         return [Level(*row) for row in zip(*columns, strict=True)]
-
-
-def _mean(sums: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
-    """Return the mean over (H, W) pixels from the sums of parts, (B, C, 1, 1) each."""
-    return torch.stack(tuple(sums)).sum(0) / math.prod(size)
 
 
 def _size(plane: Tensor) -> tuple[int, int]:

@@ -7,7 +7,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torch_vdm.cortex.transform import DEEPEST, Cortex
+from torch_vdm.cortex.transform import DEEPEST, Cortex, mean_of
 from torch_vdm.fast import SMALLEST, compiled
 from torch_vdm.quadtree import complete, own, pad_even
 
@@ -32,7 +32,7 @@ class Haar:
             ``details[l]`` is (B, C, 3, h, w): d1 (horizontal), d2 (vertical), d3 (diagonal).
         """
         size = (planes.shape[-2], planes.shape[-1])
-        mean = planes.mean((-2, -1), keepdim=True)
+        mean = mean_of(planes)
         details, lowpass = levels(planes, 1, size, fast, true_means)
         return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [planes])), mean)
 
