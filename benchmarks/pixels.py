@@ -13,11 +13,17 @@ from torch_vdm import VDM
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 
+# Side of the picture: the middle of a render. Status: choice.
+SIDE = 64
+
 # Steps of Adam, and its first rate, which falls to 0 by a cosine. Status: choice.
 STEPS, RATE = 300, 0.02
 
 # How many pixels the picture is moved to the right for the start "shift". Status: choice.
 SHIFT = 8
+
+# Below this, mean JND are drawn on the axis. Status: choice.
+LEAST = 1e-3
 
 # Steps between two points of a curve. Status: choice.
 EVERY = 10
@@ -89,15 +95,16 @@ def plot(curves: dict[str, dict[str, dict[str, list[float]]]], path: Path) -> No
         for number, (name, figures) in enumerate(losses.items()):
             style = {"color": f"C{number}", "linewidth": 1.4}
             above.plot(figures["step"], figures["PSNR"], label=name, **style)
-            below.plot(figures["step"], [max(j, 1e-4) for j in figures["JND mean"]], **style)
+            below.plot(figures["step"], [max(jnd, LEAST) for jnd in figures["JND mean"]], **style)
         above.set_title(f"from {start}", fontsize=9)
         below.set_yscale("log")
-        below.set_ylim(bottom=1e-3)
         below.axhline(1.0, color="black", linewidth=0.7, linestyle=":")
         below.set_xlabel("steps of Adam")
         for axis in (above, below):
             axis.spines[["top", "right"]].set_visible(False)
     axes[0, 0].set_ylabel("PSNR, dB")
     axes[1, 0].set_ylabel("mean JND")
-    figure.legend(loc="outside upper center", ncols=9, frameon=False, fontsize=9)
+    axes[1, 0].set_ylim(bottom=LEAST)
+    handles = axes[0, 0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside upper center", ncols=9, frameon=False, fontsize=9)
     figure.savefig(path)

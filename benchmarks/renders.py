@@ -24,10 +24,10 @@ ROOT = Path(__file__).resolve().parent.parent
 CACHE = Path(__file__).parent / "cache"
 
 # Samples a pixel of the noisy render, and of its reference. Status: choice.
-NOISY_SPP, REFERENCE_SPP = 16, 1024
+NOISY_SPP, REFERENCE_SPP = 64, 1024
 
 # Noisy renders of a scene that are trained on, with other random numbers. Status: choice.
-TAKES = 3
+TAKES = 2
 
 # Sides of the renders in pixels. Status: choice.
 SIDE = 128
@@ -113,22 +113,22 @@ def picture(
     else:
         path = scene.source
     parameters = dict.fromkeys(scene.size, str(side))
-    first = MitsubaRenderer(path, parameters, seed=1, aov=True)
-    what = f"{first.fingerprint} {first.version} {side} {takes} {noisy_spp} {reference_spp}"
-    kept = cache / f"{path.stem}_{hashlib.sha256(what.encode()).hexdigest()[:16]}.npz"
-    if not kept.exists():
-        shots = []
-        for take in range(takes):
-            renderer = MitsubaRenderer(path, parameters, seed=1 + take, aov=True)
-            colour = _colour(renderer, noisy_spp)
-            shots.append(np.concatenate((colour, [*renderer.aovs().values()])))
-        reference = _colour(MitsubaRenderer(path, parameters, seed=0), reference_spp)
-        noisy = np.stack(shots).astype(np.float32)
-        with tempfile.NamedTemporaryFile(dir=cache, suffix=".npz", delete=False) as file:
-            np.savez_compressed(file, noisy=noisy, reference=reference.astype(np.float32))
-        Path(file.name).replace(kept)
-    with np.load(kept) as planes:
-        return _exposed(scene.name, planes["noisy"], planes["reference"])
+
+    def render(seed: int, spp: int, guides: bool) -> NDArray[np.float32]:
+        renderer = MitsubaRenderer(path, parameters, seed=seed, aov=guides)
+        what = f"{renderer.fingerprint} {renderer.version} {seed} {spp} {guides}"
+        kept = cache / f"{path.stem}_{hashlib.sha256(what.encode()).hexdigest()[:16]}.npy"
+        if not kept.exists():
+            colour = _colour(renderer, spp)
+            planes = np.concatenate((colour, [*renderer.aovs().values()])) if guides else colour
+            with tempfile.NamedTemporaryFile(dir=cache, suffix=".npy", delete=False) as file:
+                np.save(file, planes.astype(np.float32))
+            Path(file.name).replace(kept)
+        stored: NDArray[np.float32] = np.load(kept)
+        return stored
+
+    noisy = np.stack([render(1 + take, noisy_spp, guides=True) for take in range(takes)])
+    return _exposed(scene.name, noisy, render(0, reference_spp, guides=False))
 
 
 def _colour(renderer: MitsubaRenderer, spp: int) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ at most 2 % over the best one.
 import hashlib
 import importlib.metadata
 import importlib.util
+import logging
 import statistics
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -65,6 +66,7 @@ def run(quick: bool, output: Path | None) -> None:
     a quick run keeps nothing.
     """
     torch.set_num_threads(1 if quick else 2)
+    logging.disable(logging.WARNING)  # cvvdp warns of every picture that is black
     if quick:
         with tempfile.TemporaryDirectory() as folder:
             _run(Path(folder), output, quick)
@@ -105,8 +107,7 @@ def _run(cache: Path, output: Path | None, quick: bool) -> None:
         result["losses"][name] = judge(
             {f"seed {seed}": _denoiser(networks[name, seed]) for seed in seeds}, held_out, found
         )
-    # In the open picture of the still life.
-    reference = encode_srgb(_named(held_out, SHOWN).reference).clamp(0.0, 1.0)[None]
+    reference = _middle(encode_srgb(_named(held_out, SHOWN).reference), pixels.SIDE)[None]
     result["pixels"] = pixel_curves(reference, 10 if quick else pixels.STEPS)
     text = _text(result)
     print(text)
@@ -211,6 +212,12 @@ def winner(result: Mapping[str, Any], figure: str) -> str:
 
 def _denoiser(network: unet.UNet) -> Callable[[Tensor], Tensor]:
     return lambda noisy: unet.denoise(network, noisy)
+
+
+def _middle(image: Tensor, side: int) -> Tensor:
+    """Return the middle of an image (3, H, W), clipped to [0, 1]."""
+    top, left = ((length - side) // 2 for length in image.shape[-2:])
+    return image[:, top : top + side, left : left + side].clamp(0.0, 1.0)
 
 
 def _named(pictures: Sequence[Picture], name: str) -> Picture:
@@ -328,7 +335,8 @@ def _plot(shown: Picture, networks: Mapping[str, unet.UNet], path: Path) -> None
         below.set_title(f"{float((jnd > 1.0).float().mean()):.0%} over 1 JND", fontsize=9)
     axes[0, -1].imshow(_screen(reference), interpolation="nearest")
     axes[0, -1].set_title("reference", fontsize=10)
-    figure.colorbar(drawn, ax=axes[1, -1], location="left", fraction=0.3, label="JND", extend="max")
+    bar = axes[1, -1].inset_axes((0.02, 0.05, 0.07, 0.9))
+    figure.colorbar(drawn, cax=bar, label="JND", extend="max")
     figure.savefig(path)
 
 
