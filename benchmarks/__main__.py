@@ -10,7 +10,7 @@ BENCHMARKS = {
     "calibrate": "fit the observer to human thresholds; 15 minutes, 1 with --quick",
     "speed": "time and memory beside kornia's SSIM; 6 minutes, 1 with --quick",
     "stability": "hard images in every precision; 1 minute, 10 seconds with --quick",
-    "stopping": "whether the sampler stops honestly; 40 minutes, 10 seconds with --quick",
+    "stopping": "whether the sampler stops honestly; 30 minutes, 10 seconds with --quick",
 }
 
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from sampling.statistics import FIRST, SECOND, Statistics, scalar_second
-from torch_vdm.quadtree import push
 
 Plane = NDArray[np.float64]
 
@@ -53,7 +52,7 @@ def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
     while levels:
         nodes = levels.pop()
         own, own_mean = _own(nodes)
-        parent, parent_mean = _push(estimate, nodes.shape[1:]), _push(mean, nodes.shape[1:])
+        parent, parent_mean = _between(estimate, nodes), _between(mean, nodes)
         second, fourth = scalar_second(parent[:6]), parent[6]
         kurtosis = _ratio(fourth, second * second, NORMAL)
         freedom = 2.0 * nodes[11] / np.maximum(kurtosis - 1.0, 1e-3)
@@ -111,6 +110,13 @@ def _four(plane: Plane) -> Plane:
     return total
 
 
-def _push(plane: Plane, size: tuple[int, ...]) -> Plane:
-    """Give every child on a plane of ``size`` = (h, w) the value of its parent."""
-    return push(torch.from_numpy(plane)[None], (size[0], size[1]))[0].numpy()
+def _between(parents: Plane, nodes: Plane) -> Plane:
+    """Give every node what its four nearest parents have, by their distance (bilinear).
+
+    Its own parent alone would know nothing of what lies across the border of a large node: pixels
+    beside that border stayed at no variance where rare light ended there.
+    """
+    height, width = nodes.shape[1:]
+    tensor = torch.from_numpy(parents)[None]
+    between = functional.interpolate(tensor, scale_factor=2.0, mode="bilinear")
+    return between[0, :, :height, :width].numpy()
