@@ -79,7 +79,7 @@ def test_rare_light_is_known_across_the_border_of_a_large_node() -> None:
     """A row of pixels above the middle, lit as those below: they alone in their half of the tree.
 
     With 1 event in 1000 samples and 500 samples a pixel, five pixels have seen nothing in 8 % of
-    runs; without their neighbours across the border they were left at 1e-6 of their variance.
+    runs; without their neighbours across the border they were left at 1e-4 of their variance.
     """
     light = np.zeros((32, 32, 3))
     light[15:22, 10:20] = 0.003
@@ -89,7 +89,7 @@ def test_rare_light_is_known_across_the_border_of_a_large_node() -> None:
         renderer = Synthetic(0.0 * light, light, chance, seed)
         shrunk = green(pooled_covariance(drawn(renderer, 500), renderer.size))
         found.append(shrunk[15, 10:20].min() / renderer.covariance[15, 15, 1, 1])
-    assert min(found) > 0.02
+    assert min(found) > 0.1
 
 
 def test_it_scales_with_the_radiance() -> None:
