@@ -9,7 +9,7 @@ half-buffer's own stop, at one threshold for all scenes.
 Synthetic scenes have a mean that is known exactly. For scenes of Mitsuba it is the mean of two
 references, each rendered adaptively at a quarter of the tolerance from a seed of its own; how far
 they are apart is shown, and their mean is about half as far from the truth. They are kept in
-``benchmarks/references``.
+``benchmarks/cache``.
 
 Runs are kept as they are done, in ``stopping.partial.json``: started again with the same code, an
 interrupted benchmark goes on. The seeds are not those on which the sampler was developed (1 to 20).
@@ -60,7 +60,7 @@ FIRST_SEED = 1001
 REFERENCE_SEEDS, REFERENCE_TOLERANCE = (1_000_001, 1_000_002), 0.25
 
 ROOT = Path(__file__).resolve().parent.parent
-REFERENCES = ROOT / "benchmarks" / "references"
+REFERENCES = ROOT / "benchmarks" / "cache" / "stopping"
 
 
 class Table(NamedTuple):

@@ -26,6 +26,10 @@ LARGEST_PRIOR = 1000.0
 # would otherwise speak for all their neighbours.
 FARTHEST = 4.0
 
+# A node is at most so many times as bright as its parent, the mean of four. More is left over where
+# a channel is 0 but for rounding, as in a saturated colour.
+LARGEST_SCALE = 4.0
+
 # Kurtosis of normal noise, where none has been seen.
 NORMAL = 3.0
 
@@ -59,7 +63,7 @@ def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
         # The mean, which scales what the parent knows, is shrunk by the least weight.
         weight = PRIOR / (PRIOR + freedom)
         mean = weight * parent_mean + (1.0 - weight) * own_mean
-        scale = _ratio(np.abs(mean), np.abs(parent_mean), 1.0)
+        scale = np.minimum(_ratio(np.abs(mean), np.abs(parent_mean), 1.0), LARGEST_SCALE)
         scalar = scale.mean(0)
         prior = parent * np.concatenate((scale[FIRST] * scale[SECOND], scalar[None] ** 4))
         worth = _worth(scalar_second(own[:6]), scalar_second(prior[:6]), freedom)

@@ -120,3 +120,21 @@ def test_it_is_a_covariance() -> None:
     for row, (one, other) in enumerate(zip(FIRST, SECOND, strict=True)):
         matrices[:, one, other] = matrices[:, other, one] = shrunk[row].reshape(-1)
     assert np.linalg.eigvalsh(matrices).min() > 0.0
+
+
+def test_a_saturated_colour_does_not_scale_its_parents_variance_without_bound() -> None:
+    # Red or green by chance, and never both: whole blocks of pixels have seen one of them alone, and
+    # their other channel is 0 but for rounding.
+    size, count = (32, 32), 16
+    red, green = np.zeros((*size, 3)), np.zeros((*size, 3))
+    red[..., 0], green[..., 1] = 1.0, 0.297
+    renderer = Synthetic(red, green - red, np.full(size, 0.5), 3)
+    pixels = np.arange(size[0] * size[1])
+    statistics = Statistics(len(pixels))
+    statistics.add(renderer.sample(pixels, 0 * pixels, 0 * pixels + count))
+    pooled = pooled_covariance(statistics, size)[FIRST == SECOND]
+    true = renderer.covariance[0, 0].diagonal()
+    # No pixel's estimate is over what a single one could see, p (1 - p) at p = 1/2, but for the
+    # scale by which its mean may exceed the others'.
+    assert (pooled.mean((1, 2)) <= 1.2 * true + 1e-12).all()
+    assert (pooled.max((1, 2)) <= 4.0 * true + 1e-12).all()
