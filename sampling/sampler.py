@@ -298,7 +298,7 @@ class Sampler:
         """End a round: predict, then stop, or say how many samples every pixel is to have."""
         statistics = self._statistics
         model = Model(self.metric, statistics, self.size)
-        predicted = model.predicted_maximum()
+        predicted = model.predicted_maximum(self.settings.tolerance)
         totals = model.totals()
         largest = float(totals.max()) ** (1.0 / model.exponent)
         # The boundary images say where, the simulation how much.
