@@ -56,16 +56,22 @@ def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
     while levels:
         nodes = levels.pop()
         own, own_mean = _own(nodes)
-        parent, parent_mean = _between(estimate, nodes), _between(mean, nodes)
-        second, fourth = scalar_second(parent[:6]), parent[6]
-        kurtosis = _ratio(fourth, second * second, NORMAL)
+        squares = np.concatenate((mean * mean, scalar_second(estimate[:6])[None] ** 2))
+        between = _between(np.concatenate((estimate, mean, squares)), nodes)
+        parent, parent_mean = between[:7], between[7:10]
+        # Over means of squares, and not squares of means: else a node near a lamp would have its
+        # noise but neither its light nor the kurtosis of it.
+        kurtosis = _ratio(parent[6], between[13], NORMAL)
         freedom = 2.0 * nodes[11] / np.maximum(kurtosis - 1.0, 1e-3)
-        # The mean, which scales what the parent knows, is shrunk by the least weight.
+        # The mean, which scales what the parents know, is shrunk by the least weight.
         weight = PRIOR / (PRIOR + freedom)
         mean = weight * parent_mean + (1.0 - weight) * own_mean
-        scale = np.minimum(_ratio(np.abs(mean), np.abs(parent_mean), 1.0), LARGEST_SCALE)
-        scalar = scale.mean(0)
-        prior = parent * np.concatenate((scale[FIRST] * scale[SECOND], scalar[None] ** 4))
+        chance = (1.0 - weight) ** 2 * parent[:6][FIRST == SECOND] / np.maximum(nodes[11], 1.0)
+        known = np.sqrt(between[10:13] + chance)
+        scale = np.minimum(_ratio(np.abs(mean), known, 1.0), LARGEST_SCALE)
+        covariance = parent[:6] * scale[FIRST] * scale[SECOND]
+        fourth = kurtosis * scalar_second(covariance) ** 2
+        prior = np.concatenate((covariance, fourth[None]))
         worth = _worth(scalar_second(own[:6]), scalar_second(prior[:6]), freedom)
         weight = worth / (worth + freedom)
         estimate = weight * prior + (1.0 - weight) * own
