@@ -90,7 +90,7 @@ class PairMetric(nn.Module):
         total, seen = self._total(test, reference)
         constants = self._constants(total.dtype, "summation_exponent")
         jnd = just_noticeable(total, constants["summation_exponent"])
-        return _masked(self._to_pixels(jnd, (test.shape[-2], test.shape[-1])), seen)
+        return masked(self._to_pixels(jnd, (test.shape[-2], test.shape[-1])), seen)
 
     def power(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the accumulated differences before the root: the map to the power of 2.4.
@@ -99,7 +99,7 @@ class PairMetric(nn.Module):
         is taken from here; see `VDMLoss`.
         """
         total, seen = self._total(test, reference)
-        return _masked(self._to_pixels(total, (test.shape[-2], test.shape[-1])), seen)
+        return masked(self._to_pixels(total, (test.shape[-2], test.shape[-1])), seen)
 
     def _constants(self, dtype: torch.dtype, *names: str) -> dict[str, Tensor]:
         """Return constants in the precision of the computation: those named, or all."""
@@ -121,8 +121,13 @@ class PairMetric(nn.Module):
             for one, other in zip(test.split(1), reference.split(1), strict=True)
         )
 
-    def _checked(self, test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return both images in the computing precision, and where they are finite (masked)."""
+    def _checked(
+        self, test: Tensor, reference: Tensor, origin: tuple[int, int, int] = (0, 0, 0)
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return both images in the computing precision, and where they are finite (masked).
+
+        ``origin`` is where a part lies in a larger batch, for messages: item, y, x.
+        """
         for name, image in (("test", test), ("reference", reference)):
             if image.ndim != 4 or image.shape[1] != 3 or 0 in image.shape:
                 raise ValueError(
@@ -150,8 +155,8 @@ class PairMetric(nn.Module):
         if self.nonfinite == "mask":
             return finite_in_both(test, reference)
         if not torch.compiler.is_compiling():
-            _require_finite("test", test)
-            _require_finite("reference", reference)
+            _require_finite("test", test, origin)
+            _require_finite("reference", reference, origin)
         return test, reference, None
 
 
@@ -195,11 +200,12 @@ def _widened(image: Tensor, dtype: torch.dtype) -> Tensor:
     return widened
 
 
-def _masked(plane: Tensor, seen: Tensor | None) -> Tensor:
+def masked(plane: Tensor, seen: Tensor | None) -> Tensor:
+    """Return a plane with 0 where a mask (B, 1, H, W) is not set."""
     return plane if seen is None else torch.where(seen, plane, 0.0)
 
 
-def _require_finite(name: str, image: Tensor) -> None:
+def _require_finite(name: str, image: Tensor, origin: tuple[int, int, int]) -> None:
     """Raise where ``image`` has NaN or infinity, naming the first such item and pixel."""
     # One cheap pass: the sum of an image that is not finite is not.
     if bool(torch.isfinite(image.detach().sum())):
@@ -211,6 +217,7 @@ def _require_finite(name: str, image: Tensor) -> None:
     channel, y, x = bad[item].nonzero()[0].tolist()
     raise ValueError(
         f"expected finite pixel values, got {int(bad[item].sum())} NaN or infinite ones in the "
-        f"{name}'s batch item {item}, the first in channel {channel} at x {x}, y {y}; "
+        f"{name}'s batch item {item + origin[0]}, the first in channel {channel} "
+        f"at x {x + origin[2]}, y {y + origin[1]}; "
         'repair them or pass nonfinite="mask"'
     )
