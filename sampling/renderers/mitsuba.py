@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sampling.renderers import hemisphere
 from sampling.renderers.llvm import OLDEST, PACKAGE, VARIABLE, find_llvm
 from sampling.renderers.protocol import Samples
 
@@ -340,7 +341,16 @@ def load_mitsuba(variant: str = "auto") -> Any:
     mi.set_variant(variant)
     # Its warnings would break the live line; what matters is told here.
     mi.set_log_level(mi.LogLevel.Error)
+    _register_materials(variant)
     return mi
+
+
+@functools.cache
+def _register_materials(variant: str) -> None:
+    """Make the materials of our own known, once to each variant."""
+    mi = importlib.import_module("mitsuba")
+    assert mi.variant() == variant
+    hemisphere.register(mi, importlib.import_module("drjit"))
 
 
 @functools.cache
