@@ -8,6 +8,7 @@ from pathlib import Path
 # Imported when asked for: each has its own needs.
 BENCHMARKS = {
     "calibrate": "fit the observer to human thresholds; 15 minutes, 1 with --quick",
+    "paper": "Figures 9 to 14, and real scenes; 60 minutes, 30 seconds with --quick",
     "speed": "time and memory beside kornia's SSIM; 6 minutes, 1 with --quick",
     "stability": "hard images in every precision; 1 minute, 10 seconds with --quick",
     "stopping": "whether the sampler stops honestly; 40 minutes, 10 seconds with --quick",

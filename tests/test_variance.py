@@ -106,8 +106,8 @@ def test_it_is_a_covariance() -> None:
 
 
 def test_a_saturated_colour_does_not_scale_its_parents_variance_without_bound() -> None:
-    # Red or green by chance, and never both: whole blocks of pixels have seen one of them alone, and
-    # their other channel is 0 but for rounding.
+    # Red or green by chance, and never both: some pixels have seen one of them alone, and their
+    # other channel is 0 but for rounding.
     size, count = (32, 32), 16
     red, green = np.zeros((*size, 3)), np.zeros((*size, 3))
     red[..., 0], green[..., 1] = 1.0, 0.297
