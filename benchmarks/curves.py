@@ -196,7 +196,9 @@ def _run(
     metric = metric_of(scene)
     settings = Settings(strategy=strategy, tolerance=1e6)
     # Compiled before the clock runs.
-    renderer.sample(np.arange(2), np.zeros(2, np.int64), np.full(2, 2))
+    every = np.arange(math.prod(renderer.size))
+    for _ in range(2):
+        renderer.sample(every, 0 * every, 0 * every + 2)
     sampler = Sampler(renderer.size, metric, settings)
     pixels = math.prod(renderer.size)
     equal = scene.equal_spp * pixels if scene.equal_spp is not None else math.inf

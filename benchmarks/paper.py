@@ -313,7 +313,12 @@ def _verdict(scenes: dict[str, Any]) -> list[dict[str, Any]]:
             ("real scenes, 2 JND: perceptual / uniform, geometric mean", found, REAL_TARGET)
         )
     return [
-        {"what": what, "found": _round(found), "at_most": bound, "met": bool(found <= bound)}
+        {
+            "what": what,
+            "found": _round(found) if math.isfinite(found) else None,
+            "at_most": bound,
+            "met": bool(found <= bound),
+        }
         for what, found, bound in checks
     ]
 
@@ -332,7 +337,7 @@ def _text(result: dict[str, Any]) -> str:
         "|---|---|---|---|",
     ]
     lines += [
-        f"| {check['what']} | {check['found']:.2f} | {check['at_most']:.2f} "
+        f"| {check['what']} | {_known(check['found'])} | {check['at_most']:.2f} "
         f"| {'met' if check['met'] else '**not met**'} |"
         for check in result["verdict"]
     ]
@@ -364,7 +369,7 @@ def _text(result: dict[str, Any]) -> str:
             lines += ["", f"## {title}: samples a pixel, seconds", "", *_needs(some)]
     lines += ["", "## Images at equal samples", "", *_equals(scenes)]
     losses = [
-        f"{name} ({share(figures, other, 'spp'):.2f} of {other})"
+        f"{name} ({_known(share(figures, other, 'spp'))} of {other})"
         for name, figures in scenes.items()
         for other in ("uniform", "objective", "halfbuffer")
         if share(figures, other, "spp") > 1.0
@@ -395,7 +400,7 @@ def _needs(scenes: dict[str, Any]) -> list[str]:
             lines.append(
                 f"| {name} | {table['tolerance']:g} | {figures['seeds']} "
                 f"| {figures['reference_error']:.2f} | {' | '.join(cells)} "
-                f"| {at_most}{share(figures, 'uniform', 'spp', place):.2f} "
+                f"| {at_most}{_known(share(figures, 'uniform', 'spp', place))} "
                 f"| {seconds} |"
             )
     return lines
@@ -429,6 +434,10 @@ def _curves(found: dict[str, Found]) -> dict[str, Any]:
         }
         for name, one in found.items()
     }
+
+
+def _known(value: float | None) -> str:
+    return "not reached" if value is None or math.isinf(value) else f"{value:.2f}"
 
 
 def _percent(value: float, slowest: float) -> str:

@@ -38,14 +38,16 @@ def draw(output: Path, found: Sequence["Found"], strategies: Sequence[str]) -> N
 
 def refinement(path: Path, steps: Sequence[tuple[float, Plane, Plane, float]]) -> None:
     """Draw the image and where its samples lie after each round (Fig. 9)."""
-    figure, axes = _figure(2, len(steps), 1.5 * len(steps) + 0.4, 3.5)
+    figure, axes = _figure(2, len(steps) + 1, 1.5 * len(steps) + 1.2, 3.5)
     for i, (spp, image, count, true) in enumerate(steps):
         _show(axes[0][i], image)
         axes[0][i].set_title(f"{spp:.0f} a pixel\n{true:.1f} JND", fontsize=8)
         shown = _density(axes[1][i], count)
     axes[0][0].set_ylabel("image", fontsize=8)
     axes[1][0].set_ylabel("samples", fontsize=8)
-    _bar(figure, shown, axes[1], "log2 of samples\nover their mean")
+    axes[0][-1].axis("off")
+    axes[1][-1].axis("off")
+    _bar(figure, shown, axes[1][-1], "log2 of samples\nover their mean")
     figure.savefig(path)
 
 
@@ -54,7 +56,7 @@ def _images(path: Path, one: "Found", strategies: Sequence[str]) -> None:
     seed = min(one.runs[strategies[0]])
     planes = {name: one.runs[name][seed].planes for name in strategies}
     largest = max(float(p["jnd"].max()) for p in planes.values())
-    figure, axes = _figure(3, len(strategies) + 1, 8.6, 5.4)
+    figure, axes = _figure(3, len(strategies) + 1, 8.6, 5.2)
     for i, name in enumerate(strategies):
         axes[0][i].set_title(NAMES.get(name, name), fontsize=9)
         density = _density(axes[0][i], planes[name]["count"])
@@ -67,10 +69,10 @@ def _images(path: Path, one: "Found", strategies: Sequence[str]) -> None:
         axis.set_ylabel(label, fontsize=8)
     _show(axes[1][-1], one.reference.image)
     axes[1][-1].set_title("reference", fontsize=9)
-    axes[0][-1].set_visible(False)
-    axes[2][-1].set_visible(False)
-    _bar(figure, density, axes[0][:-1], "log2 of samples\nover their mean")
-    _bar(figure, jnd, axes[2][:-1], "JND")
+    axes[0][-1].axis("off")
+    axes[2][-1].axis("off")
+    _bar(figure, density, axes[0][-1], "log2 of samples\nover their mean")
+    _bar(figure, jnd, axes[2][-1], "JND")
     figure.suptitle(f"{one.scene.name}: {one.scene.equal_spp} samples a pixel", fontsize=10)
     figure.savefig(path)
 
@@ -142,7 +144,8 @@ def _density(axis: Any, count: Plane) -> Any:
     return axis.imshow(shown, "RdBu_r", vmin=-DENSITIES, vmax=DENSITIES)
 
 
-def _bar(figure: Any, shown: Any, axes: Any, label: str) -> None:
-    bar = figure.colorbar(shown, ax=list(axes), shrink=0.9, aspect=12)
+def _bar(figure: Any, shown: Any, axis: Any, label: str) -> None:
+    """Draw a scale at the left of an empty place."""
+    bar = figure.colorbar(shown, cax=axis.inset_axes((0.05, 0.05, 0.1, 0.9)))
     bar.set_label(label, fontsize=7)
     bar.ax.tick_params(labelsize=7)
