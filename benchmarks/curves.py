@@ -44,6 +44,10 @@ WHITE = 100.0
 # falls nearly as one over the samples: 1.15 of them. Status: choice.
 STEP = 0.87
 
+# A round is drawn in parts, each evenly of all that was asked, with a look at the image after each;
+# by how much a part multiplies the samples. Status: choice.
+GROWTH = 1.25
+
 # A reference is rendered from other seeds than any run. Status: choice.
 REFERENCE_SEED = 1_000_000
 
@@ -177,7 +181,7 @@ def run_of(scene: Scene, strategy: str, seed: int, reference: Reference, limits:
     """Return a run, made where it is not kept."""
     renderer = MitsubaRenderer(scene.path, scene.parameters, seed=seed)
     described = dataclasses.asdict(scene) | {"path": renderer.fingerprint, "name": ""}
-    named = [described, strategy, seed, limits, STEP, _source(), reference.error]
+    named = [described, strategy, seed, limits, STEP, GROWTH, _source(), reference.error]
     path = CACHE / f"run-{_hash(named)}.npz"
     if not path.exists():
         found = _run(scene, strategy, renderer, reference, limits)
@@ -214,36 +218,35 @@ def _run(
             sampler = _onwards(sampler, metric)
             continue
         decide += seconds if points else 0.0
-        if drawn < equal <= drawn + request.samples:
-            # The same numbers of samples for every strategy: a part of this round.
-            share = (equal - drawn) / request.samples
-            part = np.minimum(np.floor(share * request.count).astype(np.int64) + 1, request.count)
-            render += _told(sampler, renderer, request, 0 * part, part)
-            planes = {
-                "image": sampler.image,
-                "count": sampler.count.astype(np.float64),
-                "jnd": difference(metric, sampler.image, reference.image),
-            }
-            render += _told(sampler, renderer, request, part, request.count - part)
-        else:
-            render += _told(sampler, renderer, request, 0 * request.count, request.count)
-        drawn += request.samples
-        true = float(difference(metric, sampler.image, reference.image).max())
         report = sampler.report()
-        points.append(
-            {
-                "spp": drawn / pixels,
-                "true": true,
-                # By the decision before, which is the last that has been made.
-                "predicted_before": report.predicted if report is not None else math.nan,
-                "render_seconds": render,
-                "decision_seconds": decide,
-            }
-        )
-        done = true <= scene.tolerances[-1] and drawn >= equal
-        spent = drawn / pixels > limits.spp or render + decide > limits.seconds
-        if done or (scene.equal_spp is None and true <= scene.tolerances[-1]) or spent:
-            return Run(points, planes)
+        taken = 0 * request.count
+        while (taken < request.count).any():
+            # No more than makes a fine curve; and the same for every strategy, for images.
+            here = min((GROWTH - 1.0) * drawn if drawn else math.inf, float(request.samples))
+            if drawn < equal < drawn + here:
+                here = equal - drawn
+            share = min((int(taken.sum()) + here) / request.samples, 1.0)
+            part = np.maximum(np.ceil(share * request.count).astype(np.int64) - taken, 0)
+            render += _told(sampler, renderer, request, taken, part)
+            taken, drawn = taken + part, drawn + int(part.sum())
+            jnd = difference(metric, sampler.image, reference.image)
+            true = float(jnd.max())
+            points.append(
+                {
+                    "spp": drawn / pixels,
+                    "true": true,
+                    # By the decision before, which is the last that has been made.
+                    "predicted_before": report.predicted if report is not None else math.nan,
+                    "render_seconds": render,
+                    "decision_seconds": decide,
+                }
+            )
+            if drawn >= equal and not planes:
+                count = sampler.count.astype(np.float64)
+                planes = {"image": sampler.image, "count": count, "jnd": jnd}
+            reached = true <= scene.tolerances[-1] and (drawn >= equal or not math.isfinite(equal))
+            if reached or drawn / pixels > limits.spp or render + decide > limits.seconds:
+                return Run(points, planes)
 
 
 def _told(
