@@ -16,6 +16,7 @@ interrupted benchmark goes on where it was.
 """
 
 import dataclasses
+import functools
 import hashlib
 import json
 import math
@@ -309,8 +310,13 @@ def _hash(named: list[Any]) -> str:
     return hashlib.sha256(json.dumps(named, default=str, sort_keys=True).encode()).hexdigest()[:20]
 
 
+@functools.cache
 def _source() -> str:
     """Return a hash of the sampler's own code: another one makes other runs."""
     folder = Path(sampling.__file__).parent
     files = sorted(set(folder.glob("*.py")) - {folder / "cli.py", folder / "checkpoint.py"})
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
+
+# Of the code that is loaded, not of what is on the disk later.
+_source()

@@ -61,14 +61,15 @@ def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
         second, fourth = scalar_second(parent[:6]), parent[6]
         kurtosis = _ratio(fourth, second * second, NORMAL)
         freedom = 2.0 * nodes[11] / np.maximum(kurtosis - 1.0, 1e-3)
+        black = _chance_of_light(own, own_mean, freedom)
         # The mean, which scales what the parent knows, is shrunk by the least weight.
-        weight = PRIOR / (PRIOR + freedom)
+        weight = black * PRIOR / (PRIOR + freedom)
         mean = weight * parent_mean + (1.0 - weight) * own_mean
         scale = np.minimum(_ratio(np.abs(mean), np.abs(parent_mean), 1.0), LARGEST_SCALE)
         scalar = scale.mean(0)
         prior = parent * np.concatenate((scale[FIRST] * scale[SECOND], scalar[None] ** 4))
         worth = _worth(scalar_second(own[:6]), scalar_second(prior[:6]), freedom)
-        weight = worth / (worth + freedom)
+        weight = black * worth / (worth + freedom)
         estimate = weight * prior + (1.0 - weight) * own
     return estimate[:6]
 
@@ -83,6 +84,19 @@ def _worth(own: Plane, prior: Plane, freedom: Plane) -> Plane:
     chance = 2.0 / np.maximum(freedom, 1e-3)
     spread = _smooth(np.minimum(apart * apart, FARTHEST)) - _smooth(np.minimum(chance, FARTHEST))
     return np.clip(2.0 / np.maximum(spread, 1e-9), PRIOR, LARGEST_PRIOR)
+
+
+def _chance_of_light(own: Plane, mean: Plane, freedom: Plane) -> Plane:
+    """Return how likely it is that a node has light at all: 1 where it has shown any.
+
+    What is black is as a rule the background, or a black surface, and no sample will change it. Had
+    a share of the node, whichever, its parent's light, it would show none in ``freedom`` / 2
+    expected events with a chance of 2 / freedom; against an even chance of its being black.
+    Without this a black background beside a light that is seldom hit took most samples, for there
+    is nothing in it that noise could hide behind.
+    """
+    shown = (own[:6] != 0.0).any(0) | (mean != 0.0).any(0)
+    return np.where(shown, 1.0, 1.0 / np.maximum(1.0, 0.5 * freedom))
 
 
 def _smooth(plane: Plane) -> Plane:
