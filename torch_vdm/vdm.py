@@ -15,7 +15,7 @@ from torch_vdm.contrast import (
     opponents,
     weber_contrast,
 )
-from torch_vdm.cortex import DEEPEST, Cortex, Haar, Transform
+from torch_vdm.cortex import DEEPEST, Cortex, Haar, Transform, bands
 from torch_vdm.csf import bandpass, barten, butterworth
 from torch_vdm.display import BT709_TO_XYZ, Display
 from torch_vdm.distance import (
@@ -36,6 +36,10 @@ from torch_vdm.sarnoff import Sarnoff
 
 # Planes with more numbers are computed in parts. Status: choice, measured.
 LARGEST_AT_ONCE = 2**20
+
+# Where the weights of a filter's bands are worked out, log2 cd/m2, and between them interpolated:
+# sensitivities change by less than 3 dB from one to the next. Status: choice.
+LUMINANCES = tuple(range(-8, 18))
 
 
 # A Butterworth filter's parameters.
@@ -131,6 +135,9 @@ class VDM(PairMetric):
         if self.observer.lowpass_gains is not None:
             channels = 3 if self.effects.chromatic else 1
             constants["lowpass_gains"] = self.observer.lowpass_gains[:channels]
+        if self.transform.csf == "filter":
+            constants["band_frequencies"] = [self.ppd * cycles for cycles in bands.frequencies()]
+            constants["band_weights"] = bands.weights()
         for name, value in constants.items():
             self.register_buffer(name, torch.as_tensor(value, dtype=torch.float64))
 
@@ -209,7 +216,71 @@ class VDM(PairMetric):
         else:
             rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
             planes = torch.cat([_light(part, *around) for part in image.split(rows, -2)], -2)
-        return self.transform.decompose(planes, self._fast, self.observer.true_means)
+        true_means = self.observer.true_means
+        if self.transform.csf == "levels":
+            return self.transform.decompose(planes, self._fast, true_means)
+        mean = planes.mean((-2, -1), keepdim=True)
+        seen = self._weighted_contrast(planes)
+        return self.transform.decompose(seen, self._fast, true_means)._replace(mean=mean)
+
+    def _weighted_contrast(self, planes: Tensor) -> Tensor:
+        """Return the weighted contrast of A, C1, C2, 1 at threshold, of cone planes (B, 3, H, W).
+
+        The stages from chromatic aberration to the contrast sensitivity on smooth bands, each in
+        its own lowpass and luminance, and all bands together again: (B, channels, H, W).
+        """
+        constants = self._constants(planes.dtype)
+        passed = self._passed(constants["band_frequencies"], constants)
+        weights = self._band_weights(constants)
+        parted = bands.parted(planes, self._fast)
+        seen = []
+        first = 0
+        for band, around, lowpass in zip(*parted, strict=True):
+            some = slice(first, first + band.shape[2])
+            first = some.stop
+            fast = self._fast and lowpass.numel() >= SMALLEST
+            size = (band.shape[-2], band.shape[-1])
+            if self.observer.adaptation_luminance is None:
+                weigh = compiled(_band_sensitivity) if fast else _band_sensitivity
+                at_next = weigh(lowpass, weights[:, some].clone(), constants)
+                sensitivity = bands.expanded(at_next.flatten(1, 2), size, self._fast)
+                sensitivity = sensitivity.unflatten(1, at_next.shape[1:3])
+            else:
+                sensitivity = weights[None, :, some, None]
+            contrast = compiled(_band_contrast) if fast else _band_contrast
+            seen.append(
+                contrast(
+                    band,
+                    around,
+                    passed[some].clone(),
+                    sensitivity,
+                    constants["dark_cones"],
+                    constants["opponents"],
+                )
+            )
+        if not seen:  # one pixel
+            return 0.0 * planes[:, : len(constants["opponents"])]
+        return bands.gathered(seen, self._fast)
+
+    def _band_weights(self, constants: dict[str, Tensor]) -> Tensor:
+        """Return what weights bands so that the contrast sensitivity passes at their frequencies.
+
+        (channels, bands, luminances), at `LUMINANCES`, or one for all of them.
+        """
+        frequency = constants["band_frequencies"]
+        ones = torch.ones_like(frequency)
+        bright = self._bright(frequency[None], ones[None], constants)[0]
+        if self.observer.adaptation_luminance is None:
+            # Of the light alone: the eye's own is added to it again.
+            luminances = torch.exp2(ones.new_tensor(LUMINANCES)) - constants["dark_light"]
+            grey = luminances * constants["cones"].sum(1, keepdim=True)
+            level = Level(ones, frequency, ones, bright)
+            chromatic = self.effects.chromatic
+            sensitivity = _sensitivity(grey[None, :, None], level, constants, chromatic)[0, :, :, 0]
+        else:
+            sensitivity = bright.unsqueeze(-1)
+        # No matrix product, which autocast would round.
+        return (constants["band_weights"][:, :, None] * sensitivity.unsqueeze(1)).sum(2)
 
     def respond(self, cortex: Cortex) -> tuple[Tensor, ...]:
         """Return the responses of one image: chromatic aberration to the transducer.
@@ -324,14 +395,16 @@ class VDM(PairMetric):
 
     def _sight(
         self, cortex: Cortex, number: int, level: Level, constants: dict[str, Tensor]
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor | None, Tensor]:
         """Return what turns a level's details into contrasts and weights them.
 
         For each cone (B, 3, h, w): the share that chromatic aberration leaves, over the parent's
         adaptation; scaled at the parents, of which there are fewer. For each channel the contrast
         sensitivity, (B, channels, orientations, h, w), or one orientation or node of it where all
-        have the same.
+        have the same. Of details that are weighted contrast already: None, and one over the gains.
         """
+        if self.transform.csf == "filter":
+            return None, (1.0 / level.gain)[None, None, :, None, None]
         parent = cortex.parent_lowpass(number)
         size = (cortex.details[number].shape[-2], cortex.details[number].shape[-1])
         fast = self._fast and parent.numel() >= SMALLEST
@@ -351,12 +424,25 @@ class VDM(PairMetric):
         if count == 0:
             return []
         frequency, gain = (constants[name][:count].flip(0) for name in ("frequencies", "gains"))
-        if self.effects.aberration:
-            passed = attenuation(
-                frequency[:, 0], constants["aberration_cutoff"], constants["aberration_exponent"]
-            )
-        else:
-            passed = torch.ones_like(frequency[:, :1]).expand(-1, 3)
+        passed = self._passed(frequency[:, 0], constants)
+        bright = self._bright(frequency, gain, constants)
+        # Copies, for compiled code is specialised on the offset of a view.
+        columns = [[row.clone() for row in part] for part in (passed, frequency, gain, bright)]
+        return [Level(*row) for row in zip(*columns, strict=True)]
+
+    def _passed(self, frequency: Tensor, constants: dict[str, Tensor]) -> Tensor:
+        """Return the share (levels, 3) of the cones' details that chromatic aberration leaves."""
+        if not self.effects.aberration:
+            return torch.ones_like(frequency).unsqueeze(1).expand(-1, 3)
+        return attenuation(
+            frequency, constants["aberration_cutoff"], constants["aberration_exponent"]
+        )
+
+    def _bright(self, frequency: Tensor, gain: Tensor, constants: dict[str, Tensor]) -> Tensor:
+        """Return the sensitivity of all channels, or of C1 and C2 where the luminance is local.
+
+        (levels, channels, as many) from (levels, as many); in bright light, over the gain.
+        """
         channels = []
         if self.observer.adaptation_luminance is not None:
             luminance, size = constants["adaptation_luminance"], constants["achromatic_size"]
@@ -366,10 +452,7 @@ class VDM(PairMetric):
                 butterworth(frequency, *(constants[f"{name}_{part}"] for part in FILTER))
                 for name in ("red_green", "yellow_violet")
             ]
-        bright = torch.stack(channels, 1) / gain.unsqueeze(1) if channels else gain.unsqueeze(1)
-        # Copies, for compiled code is specialised on the offset of a view.
-        columns = [[row.clone() for row in part] for part in (passed, frequency, gain, bright)]
-        return [Level(*row) for row in zip(*columns, strict=True)]
+        return torch.stack(channels, 1) / gain.unsqueeze(1) if channels else gain.unsqueeze(1)
 
 
 def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) -> Tensor:
@@ -379,7 +462,7 @@ def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) ->
 
 def _response(
     details: Tensor,
-    scale: Tensor,
+    scale: Tensor | None,
     sensitivity: Tensor,
     matrix: Tensor,
     exponent: Tensor,
@@ -388,7 +471,7 @@ def _response(
     phases: int,
 ) -> Tensor:
     """Return the responses of one level of one image: local contrast to the transducer."""
-    contrast = opponents(local_contrast(details, scale), matrix)
+    contrast = details if scale is None else opponents(local_contrast(details, scale), matrix)
     weighted = contrast * sensitivity
     if signed:
         return signed_transducer(weighted, exponent, phases) if masking else weighted
@@ -398,9 +481,9 @@ def _response(
 def _response_difference(
     details: Tensor,
     other_details: Tensor,
-    scale: Tensor,
+    scale: Tensor | None,
     sensitivity: Tensor,
-    other_scale: Tensor,
+    other_scale: Tensor | None,
     other_sensitivity: Tensor,
     matrix: Tensor,
     exponent: Tensor,
@@ -444,6 +527,38 @@ def _sensitivity(
         return achromatic
     dim = torch.exp2(-constants["chromatic_dimming"] * dark)
     return torch.cat((achromatic, level.sensitivity[..., None, None] * dim), 1)
+
+
+def _band_sensitivity(lowpass: Tensor, weights: Tensor, constants: dict[str, Tensor]) -> Tensor:
+    """Return the weights of bands in the local luminance, (B, channels, bands, h, w).
+
+    ``lowpass`` is (B, 3, h, w); ``weights`` (channels, bands, luminances) as `LUMINANCES` has them,
+    and between them linear.
+    """
+    seen = mix(constants["luminance_of_cones"], lowpass).clamp_min(0.0) + constants["dark_light"]
+    last = len(LUMINANCES) - 1
+    place = (torch.log2(seen[:, 0]) - LUMINANCES[0]).clamp(0.0, last)
+    low = place.detach().floor().clamp_max(last - 1.0)
+    below, above = weights[..., low.long()], weights[..., low.long() + 1]
+    return (below + (above - below) * (place - low)).permute(2, 0, 1, 3, 4)
+
+
+def _band_contrast(
+    band: Tensor,
+    around: Tensor,
+    passed: Tensor,
+    sensitivity: Tensor,
+    dark_cones: Tensor,
+    matrix: Tensor,
+) -> Tensor:
+    """Return the weighted contrast (B, channels, h, w) of the bands (B, 3, n, h, w) of a scale.
+
+    ``around`` (B, 3, h, w) is what the eye is adapted to, ``passed`` (n, 3) what chromatic
+    aberration leaves, ``sensitivity`` (B, channels, n, h, w) or alike.
+    """
+    contrast = local_contrast(band, 1.0 / adapted(around, dark_cones))
+    left = contrast * passed.T[:, :, None, None]
+    return (opponents(left, matrix) * sensitivity).sum(2)
 
 
 def _pooled_energy(surrounded: Tensor, nodes: int, exponent: Tensor) -> Tensor:
