@@ -26,7 +26,7 @@ from torch import Tensor
 
 from benchmarks import record
 from benchmarks.calibrate import HIGHEST_CONTRAST, MECHANISMS, by_mechanism, centred
-from benchmarks.peers import clipped, installed
+from benchmarks.peers import Peer, clipped, installed
 from benchmarks.speed import images, status
 from benchmarks.thresholds import Threshold, pattern, read_thresholds, render, sampling
 from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar, Steerable

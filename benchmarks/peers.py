@@ -104,7 +104,8 @@ def _ms_ssim() -> Peer:
         )
 
     def values(tests: Tensor, reference: Tensor, _: float) -> Tensor:
-        return 1.0 - similarity(*_coded_pair(tests, reference)).reshape(-1, 1)
+        seen: Tensor = similarity(*_coded_pair(tests, reference))
+        return 1.0 - seen.reshape(-1, 1)
 
     return Peer(
         "MS-SSIM",

@@ -231,29 +231,29 @@ class VDM(PairMetric):
         """
         constants = self._constants(planes.dtype)
         passed = self._passed(constants["band_frequencies"], constants)
-        weights = self._band_weights(constants)
+        weights, local = self._band_weights(constants)
         parted = bands.parted(planes, self._fast)
         seen = []
         first = 0
-        for band, around, lowpass in zip(*parted, strict=True):
-            some = slice(first, first + band.shape[2])
+        for scale, around, lowpass in zip(*parted, strict=True):
+            some = slice(first, first + len(scale))
             first = some.stop
             fast = self._fast and lowpass.numel() >= SMALLEST
-            size = (band.shape[-2], band.shape[-1])
-            if self.observer.adaptation_luminance is None:
+            at_places = None
+            if local is not None:
                 weigh = compiled(_band_sensitivity) if fast else _band_sensitivity
-                at_next = weigh(lowpass, weights[:, some].clone(), constants)
-                sensitivity = bands.expanded(at_next.flatten(1, 2), size, self._fast)
-                sensitivity = sensitivity.unflatten(1, at_next.shape[1:3])
-            else:
-                sensitivity = weights[None, :, some, None]
+                rows = torch.cat((local[some], local[-1:]))
+                at_places = bands.expanded(
+                    weigh(lowpass, rows, constants), (around.shape[-2], around.shape[-1]), fast
+                )
             contrast = compiled(_band_contrast) if fast else _band_contrast
             seen.append(
                 contrast(
-                    band,
+                    scale,
                     around,
                     passed[some].clone(),
-                    sensitivity,
+                    weights[:, some].clone(),
+                    at_places,
                     constants["dark_cones"],
                     constants["opponents"],
                 )
@@ -262,25 +262,31 @@ class VDM(PairMetric):
             return 0.0 * planes[:, : len(constants["opponents"])]
         return bands.gathered(seen, self._fast)
 
-    def _band_weights(self, constants: dict[str, Tensor]) -> Tensor:
+    def _band_weights(self, constants: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
         """Return what weights bands so that the contrast sensitivity passes at their frequencies.
 
-        (channels, bands, luminances), at `LUMINANCES`, or one for all of them.
+        (channels, bands), and, where the luminance is local, what they are multiplied by at
+        `LUMINANCES`, (bands + 1, luminances): A's by the rows of the bands, C1's and C2's by the
+        last.
         """
         frequency = constants["band_frequencies"]
         ones = torch.ones_like(frequency)
         bright = self._bright(frequency[None], ones[None], constants)[0]
-        if self.observer.adaptation_luminance is None:
-            # Of the light alone: the eye's own is added to it again.
-            luminances = torch.exp2(ones.new_tensor(LUMINANCES)) - constants["dark_light"]
-            grey = luminances * constants["cones"].sum(1, keepdim=True)
-            level = Level(ones, frequency, ones, bright)
-            chromatic = self.effects.chromatic
-            sensitivity = _sensitivity(grey[None, :, None], level, constants, chromatic)[0, :, :, 0]
-        else:
-            sensitivity = bright.unsqueeze(-1)
-        # No matrix product, which autocast would round.
-        return (constants["band_weights"][:, :, None] * sensitivity.unsqueeze(1)).sum(2)
+        # No matrix products, which autocast would round.
+        weights = (constants["band_weights"] * bright.unsqueeze(1)).sum(2)
+        if self.observer.adaptation_luminance is not None:
+            return weights, None
+        # Of the light alone: the eye's own is added to it again.
+        luminances = torch.exp2(ones.new_tensor(LUMINANCES)) - constants["dark_light"]
+        grey = luminances * constants["cones"].sum(1, keepdim=True)
+        level = Level(ones, frequency, ones, bright)
+        chromatic = self.effects.chromatic
+        sensitivity = _sensitivity(grey[None, :, None], level, constants, chromatic)[0, :, :, 0]
+        achromatic = (constants["band_weights"][..., None] * sensitivity[0]).sum(1)
+        dim = sensitivity[-1, 0] / bright[-1, 0]
+        if not chromatic:
+            weights = weights[:0]
+        return torch.cat((ones[None], weights)), torch.cat((achromatic, dim[None]))
 
     def respond(self, cortex: Cortex) -> tuple[Tensor, ...]:
         """Return the responses of one image: chromatic aberration to the transducer.
@@ -529,36 +535,55 @@ def _sensitivity(
     return torch.cat((achromatic, level.sensitivity[..., None, None] * dim), 1)
 
 
-def _band_sensitivity(lowpass: Tensor, weights: Tensor, constants: dict[str, Tensor]) -> Tensor:
-    """Return the weights of bands in the local luminance, (B, channels, bands, h, w).
+def _band_sensitivity(lowpass: Tensor, table: Tensor, constants: dict[str, Tensor]) -> Tensor:
+    """Return the rows of a table at the local luminance, (B, rows, h, w).
 
-    ``lowpass`` is (B, 3, h, w); ``weights`` (channels, bands, luminances) as `LUMINANCES` has them,
-    and between them linear.
+    ``lowpass`` is (B, 3, h, w); ``table`` is at `LUMINANCES`, and between them linear.
     """
     seen = mix(constants["luminance_of_cones"], lowpass).clamp_min(0.0) + constants["dark_light"]
     last = len(LUMINANCES) - 1
     place = (torch.log2(seen[:, 0]) - LUMINANCES[0]).clamp(0.0, last)
     low = place.detach().floor().clamp_max(last - 1.0)
-    below, above = weights[..., low.long()], weights[..., low.long() + 1]
-    return (below + (above - below) * (place - low)).permute(2, 0, 1, 3, 4)
+    index, rest = low.long(), place - low
+    return torch.stack([torch.lerp(row[:-1][index], row[1:][index], rest) for row in table], 1)
 
 
 def _band_contrast(
-    band: Tensor,
+    scale: tuple[Tensor, ...],
     around: Tensor,
     passed: Tensor,
-    sensitivity: Tensor,
+    weights: Tensor,
+    at_places: Tensor | None,
     dark_cones: Tensor,
     matrix: Tensor,
 ) -> Tensor:
-    """Return the weighted contrast (B, channels, h, w) of the bands (B, 3, n, h, w) of a scale.
+    """Return the weighted contrast (B, channels, h, w) of the n bands (B, 3, h, w) of a scale.
 
     ``around`` (B, 3, h, w) is what the eye is adapted to, ``passed`` (n, 3) what chromatic
-    aberration leaves, ``sensitivity`` (B, channels, n, h, w) or alike.
+    aberration leaves, ``weights`` (channels, n), ``at_places`` (B, n + 1, h, w) what multiplies
+    those of A, and of C1 and C2, where they are local.
     """
-    contrast = local_contrast(band, 1.0 / adapted(around, dark_cones))
-    left = contrast * passed.T[:, :, None, None]
-    return (opponents(left, matrix) * sensitivity).sum(2)
+    adaptation = 1.0 / adapted(around, dark_cones)
+    achromatic: list[Tensor] = []
+    chromatic: list[Tensor] = []
+    for number, band in enumerate(scale):
+        contrast = local_contrast(band.unsqueeze(2), adaptation).squeeze(2)
+        mixing = matrix * passed[number] * weights[:, number, None]
+        # A by itself, for its weights follow the luminance band by band.
+        seen = opponents(contrast, mixing[:1])
+        achromatic.append(seen if at_places is None else seen * at_places[:, number, None])
+        if len(matrix) > 1:
+            chromatic.append(opponents(contrast, mixing[1:]))
+    if not chromatic:
+        return _added(achromatic)
+    colours = _added(chromatic)
+    colours = colours if at_places is None else colours * at_places[:, -1:]
+    return torch.cat((_added(achromatic), colours), 1)
+
+
+def _added(planes: list[Tensor]) -> Tensor:
+    """Return the sum of one plane or two."""
+    return planes[0] if len(planes) == 1 else planes[0] + planes[1]
 
 
 def _pooled_energy(surrounded: Tensor, nodes: int, exponent: Tensor) -> Tensor:

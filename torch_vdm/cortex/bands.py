@@ -40,7 +40,7 @@ class Bands(NamedTuple):
     Attributes
     ----------
     planes
-        One tensor a scale, (B, C, n, h, w): one band, but the first of two. The first is of the
+        The bands of every scale, (B, C, h, w): one, but two of the first. The first is of the
         image's size, each next one of half its sides, rounded up. None for an image of one pixel.
     around
         One (B, C, h, w) a scale: the lowpass at the same places, without all bands so far.
@@ -48,14 +48,14 @@ class Bands(NamedTuple):
         The same, (B, C, ceil(h / 2), ceil(w / 2)), before it is brought to these places.
     """
 
-    planes: tuple[Tensor, ...]
+    planes: tuple[tuple[Tensor, ...], ...]
     around: tuple[Tensor, ...]
     next: tuple[Tensor, ...]
 
 
 def parted(image: Tensor, fast: bool = False) -> Bands:
     """Part (B, C, H, W) into bands, by compiled steps if ``fast``."""
-    planes: list[Tensor] = []
+    planes: list[tuple[Tensor, ...]] = []
     around: list[Tensor] = []
     lowpass: list[Tensor] = []
     here = image
@@ -67,7 +67,7 @@ def parted(image: Tensor, fast: bool = False) -> Bands:
         lowpass.append(reduced(here, fast))
         around.append(expanded(lowpass[-1], (here.shape[-2], here.shape[-1]), fast))
         band = here - around[-1]
-        planes.append(band.unsqueeze(2) if planes else torch.stack((finer - here, band), 2))
+        planes.append((band,) if planes else (finer - here, band))
         here = lowpass[-1]
     return Bands(tuple(planes), tuple(around), tuple(lowpass))
 
