@@ -617,17 +617,17 @@ def plot(result: dict[str, Any], path: Path) -> None:
     figure = Figure(figsize=(8.0, 4.6), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, 2, sharex=True)
-    for axis, key, title in zip(
-        axes,
-        ("achromatic_alone", "all"),
-        ("achromatic", "all mechanisms, one constant"),
-        strict=True,
-    ):
-        rungs = [(cost[n], human[n][key]) for n in RUNGS if n in human and n in cost]
+    alike = {name: of["one_gain_a_study"]["achromatic"] for name, of in human.items()}
+    panels = (
+        ("achromatic, one gain a study", alike),
+        ("all mechanisms, one constant", {name: of["all"] for name, of in human.items()}),
+    )
+    for axis, (title, error) in zip(axes, panels, strict=True):
+        rungs = [(cost[n], error[n]) for n in RUNGS if n in human and n in cost]
         axis.plot(*zip(*rungs, strict=True), "o-", color="#3b5b92", label="VDM", zorder=3)
         for name in RUNGS:
             if name in human and name in cost:
-                _label(axis, name, cost[name], human[name][key], "#3b5b92")
+                _label(axis, name, cost[name], error[name], "#3b5b92")
         for names, marker, colour, label in (
             (list(FILTERS), "s", "#7a9bd0", "CSF before"),
             (["Sarnoff", "paper's observer"], "D", "#8a6d3b", "older models"),
@@ -637,21 +637,23 @@ def plot(result: dict[str, Any], path: Path) -> None:
             if shown:
                 axis.plot(
                     [cost[n] for n in shown],
-                    [human[n][key] for n in shown],
+                    [error[n] for n in shown],
                     marker,
                     color=colour,
                     label=label,
                 )
             for name in shown:
-                _label(axis, name.replace(", CSF before", ""), cost[name], human[name][key], colour)
-        if key == "achromatic_alone" and "fast" in cost:
+                _label(
+                    axis, name.replace(", CSF before", ", filter"), cost[name], error[name], colour
+                )
+        if axis is axes[0] and "fast" in cost:
             axis.plot(
                 cost["fast"],
                 held_out["achromatic"],
                 "o",
                 markerfacecolor="none",
                 color="#3b5b92",
-                label="fast, studies left out\n(one gain a study)",
+                label="fast, on studies left out",
             )
         if "Sarnoff" in cost:
             axis.axvline(cost["Sarnoff"] / PAPERS_RATIO, color="grey", linestyle=":", linewidth=1)
@@ -665,6 +667,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
                 color="grey",
             )
         axis.set_xscale("log")
+        axis.margins(x=0.12)
         axis.set_ylim(bottom=0.0)
         axis.set_title(title, fontsize=10)
         axis.set_xlabel("milliseconds, 1920 x 1080, forward")
@@ -676,7 +679,18 @@ def plot(result: dict[str, Any], path: Path) -> None:
 
 
 def _label(axis: Any, name: str, x: float, y: float, colour: str) -> None:
-    axis.annotate(name, (x, y), textcoords="offset points", xytext=(4, 4), fontsize=7, color=colour)
+    # The ladder's below its points, others' above theirs.
+    below = name in RUNGS
+    axis.annotate(
+        name,
+        (x, y),
+        textcoords="offset points",
+        xytext=(0, -5) if below else (0, 5),
+        ha="center",
+        va="top" if below else "bottom",
+        fontsize=7,
+        color=colour,
+    )
 
 
 if __name__ == "__main__":
