@@ -191,7 +191,7 @@ class Sampler:
             raise ValueError(f"expected a height and width of at least 1, got {size}")
         if metric.display.encoding == "srgb":
             raise ValueError("expected a metric with a linear display, got sRGB-coded values")
-        if not isinstance(metric.transform, Haar):
+        if metric.transform != Haar():
             raise ValueError(f"expected a metric on the Haar transform, got {metric.transform}")
         self.size = (int(size[0]), int(size[1]))
         self.metric = metric

@@ -168,6 +168,11 @@ class TiledMetric(PairMetric):
         ``nodes``: how many nodes around a node ``paths`` takes in.
         """
         items, size = check_sources(test, reference)
+        if self.transform.csf != "levels":
+            raise ValueError(
+                'expected a transform with csf="levels" for tiles, got csf="filter", '
+                "which needs the image whole"
+            )
         shifts = self.transform.shifts
         tiling = Tiling.fit(size, side, shifts, self.transform.reach + nodes)
         device = self.summation_exponent.device

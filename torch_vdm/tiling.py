@@ -102,8 +102,8 @@ class Tiling:
         return cls(size, (side, side), levels, halo)
 
     @classmethod
-    def bands(cls, size: tuple[int, int], pixels: int, levels: int, nodes: int) -> "Tiling":
-        """Return a tiling by bands as wide as the image, of about as many pixels.
+    def strips(cls, size: tuple[int, int], pixels: int, levels: int, nodes: int) -> "Tiling":
+        """Return a tiling by strips as wide as the image, of about as many pixels.
 
         For nodes that lie side by side; ``levels`` and ``nodes`` as in `fit`.
         """

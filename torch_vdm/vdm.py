@@ -16,7 +16,7 @@ from torch_vdm.contrast import (
     opponents,
     weber_contrast,
 )
-from torch_vdm.cortex import DEEPEST, Cortex, Haar, Transform
+from torch_vdm.cortex import DEEPEST, Cortex, Haar, Transform, bands
 from torch_vdm.cortex.transform import mean_of
 from torch_vdm.csf import bandpass, barten, butterworth
 from torch_vdm.display import BT709_TO_XYZ, Display
@@ -41,13 +41,17 @@ from torch_vdm.tiling import Tiling
 # Planes with more numbers are computed in parts. Status: choice, measured.
 LARGEST_AT_ONCE = 2**18
 
-# Pixels of a band of a large image, and how many levels, from the finest, are computed in bands.
+# Pixels of a strip of a large image, and how many levels, from the finest, are computed in strips.
 # Status: choice, measured.
-BAND, BAND_LEVELS = 2**19, 2
+STRIP, STRIP_LEVELS = 2**19, 2
 
 # Levels of at most as many nodes are computed at once: there an operation costs more than the
 # numbers that it works on. Status: choice, measured.
 FEW_NODES = 64 * 64
+
+# Where the weights of a filter's bands are worked out, log2 cd/m2, and between them interpolated:
+# sensitivities change by less than 3 dB from one to the next. Status: choice.
+LUMINANCES = tuple(range(-8, 18))
 
 
 # A Butterworth filter's parameters.
@@ -76,9 +80,9 @@ class Level(NamedTuple):
 class Sight(NamedTuple):
     """What turns the details of an image at a level into contrasts and weights them."""
 
-    scale: Tensor
+    scale: Tensor | None
     """(B, 3, h, w): for each cone the share that chromatic aberration leaves, over what the
-    parent is adapted to."""
+    parent is adapted to. None where the details are weighted contrast already."""
     sensitivity: Tensor
     """(B, channels, orientations, h, w): the contrast sensitivity of each channel, or one
     orientation or node of it where all have the same."""
@@ -87,7 +91,7 @@ class Sight(NamedTuple):
         """Return what is given at the parents at their children, on a plane of ``size``."""
         shared = self.sensitivity.shape[-2:] == (1, 1)
         sensitivity = self.sensitivity if shared else push(self.sensitivity, size)
-        return Sight(push(self.scale, size), sensitivity)
+        return Sight(None if self.scale is None else push(self.scale, size), sensitivity)
 
     def of(self, orientations: slice) -> "Sight":
         """Return the sight of some orientations."""
@@ -168,6 +172,9 @@ class VDM(TiledMetric):
         if self.observer.lowpass_gains is not None:
             channels = 3 if self.effects.chromatic else 1
             constants["lowpass_gains"] = self.observer.lowpass_gains[:channels]
+        if self.transform.csf == "filter":
+            constants["band_frequencies"] = [self.ppd * cycles for cycles in bands.frequencies()]
+            constants["band_weights"] = bands.weights()
         for name, value in constants.items():
             self.register_buffer(name, torch.as_tensor(value, dtype=torch.float64))
 
@@ -189,42 +196,42 @@ class VDM(TiledMetric):
         )
 
     def _accumulated(self, test: Tensor, reference: Tensor) -> Tensor:
-        # Gradients need all that bands drop.
+        # Gradients need all that strips drop.
         graph = torch.is_grad_enabled() and (test.requires_grad or reference.requires_grad)
         if not (graph or torch.compiler.is_compiling()) and (
-            isinstance(self.transform, Haar) and math.prod(_size(test)) >= 2 * BAND
+            self.transform == Haar() and math.prod(_size(test)) >= 2 * STRIP
         ):
-            return self._accumulated_in_bands(test, reference, self.transform)
+            return self._accumulated_in_strips(test, reference, self.transform)
         return self.compare(self.represent(test), self.represent(reference))
 
-    def _accumulated_in_bands(self, test: Tensor, reference: Tensor, haar: Haar) -> Tensor:
-        """Return the same of large images, the finest levels band by band.
+    def _accumulated_in_strips(self, test: Tensor, reference: Tensor, haar: Haar) -> Tensor:
+        """Return the same of large images, the finest levels strip by strip.
 
-        A band stays in the processor's cache, and its memory is used again for the next one, where
+        A strip stays in the processor's cache, and its memory is used again for the next one, where
         whole planes would be asked from the system anew in every call.
         """
-        size, octaves = _size(test), BAND_LEVELS
+        size, octaves = _size(test), STRIP_LEVELS
         options = self._fast, self.observer.true_means
         constants = self._constants(test.dtype)
-        # For each level, coarser first, what its nodes have in each band.
+        # For each level, coarser first, what its nodes have in each strip.
         fine: list[list[Tensor]] = [[] for _ in range(octaves)]
         # For each image, the means of nodes of 2^octaves pixels, and those of rows.
         means: tuple[list[Tensor], list[Tensor]] = [], []
         means_of_rows: tuple[list[Tensor], list[Tensor]] = [], []
-        for band in Tiling.bands(size, BAND, octaves, haar.reach + 1):
-            bands: list[Cortex] = []
+        for strip in Tiling.strips(size, STRIP, octaves, haar.reach + 1):
+            strips: list[Cortex] = []
             for number, image in enumerate((test, reference)):
-                cones = self._cone_planes(cut(image, band.around))
+                cones = self._cone_planes(cut(image, strip.around))
                 # One level more, for the parents of the last.
                 cortex = haar.begin(cones, octaves + 1, *options)
-                means[number].append(cut(cortex.lowpass[1], band.within(2**octaves)))
-                means_of_rows[number].append(cut(cones, band.within(1)).mean(-1, keepdim=True))
-                bands.append(cortex)
-            for number, level in enumerate(self._levels(bands[0], constants)):
+                means[number].append(cut(cortex.lowpass[1], strip.within(2**octaves)))
+                means_of_rows[number].append(cut(cones, strip.within(1)).mean(-1, keepdim=True))
+                strips.append(cortex)
+            for number, level in enumerate(self._levels(strips[0], constants)):
                 if number > 0:
-                    local = self._local_difference(bands[0], bands[1], number, level, constants)
+                    local = self._local_difference(strips[0], strips[1], number, level, constants)
                     node = 2 ** (octaves + 1 - number)
-                    fine[number - 1].append(cut(local, band.within(node)))
+                    fine[number - 1].append(cut(local, strip.within(node)))
         first, second = (
             haar.coarser(
                 torch.cat(parts, -2), octaves, size, mean_of(torch.cat(rows, -2)), *options
@@ -296,7 +303,11 @@ class VDM(TiledMetric):
         ``image`` is (B, 3, H, W) in float32 or float64, as the display expects it.
         """
         planes = self._cone_planes(image)
-        return self.transform.decompose(planes, self._fast, self.observer.true_means)
+        options = self._fast, self.observer.true_means
+        if self.transform.csf == "levels":
+            return self.transform.decompose(planes, *options)
+        seen = self.transform.decompose(self._weighted_contrast(planes), *options)
+        return seen._replace(mean=mean_of(planes))
 
     def _cone_planes(self, image: Tensor) -> Tensor:
         """Return the cone responses (B, 3, H, W) to an image: display, cones."""
@@ -307,6 +318,72 @@ class VDM(TiledMetric):
             return planes
         rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
         return torch.cat([self._kept(_light, part, *around) for part in image.split(rows, -2)], -2)
+
+    def _weighted_contrast(self, planes: Tensor) -> Tensor:
+        """Return the weighted contrast of A, C1, C2, 1 at threshold, of cone planes (B, 3, H, W).
+
+        The stages from chromatic aberration to the contrast sensitivity on smooth bands, each in
+        its own lowpass and luminance, and all bands together again: (B, channels, H, W).
+        """
+        constants = self._constants(planes.dtype)
+        passed = self._passed(constants["band_frequencies"], constants)
+        weights, local = self._band_weights(constants)
+        parted = bands.parted(planes, self._fast)
+        seen = []
+        first = 0
+        for scale, around, lowpass in zip(*parted, strict=True):
+            some = slice(first, first + len(scale))
+            first = some.stop
+            fast = self._fast and lowpass.numel() >= SMALLEST
+            at_places = None
+            if local is not None:
+                weigh = compiled(_band_sensitivity) if fast else _band_sensitivity
+                rows = torch.cat((local[some], local[-1:]))
+                at_places = bands.expanded(
+                    weigh(lowpass, rows, constants), (around.shape[-2], around.shape[-1]), fast
+                )
+            contrast = compiled(_band_contrast) if fast else _band_contrast
+            seen.append(
+                contrast(
+                    scale,
+                    around,
+                    passed[some].clone(),
+                    weights[:, some].clone(),
+                    at_places,
+                    constants["dark_cones"],
+                    constants["opponents"],
+                )
+            )
+        if not seen:  # one pixel
+            return 0.0 * planes[:, : len(constants["opponents"])]
+        return bands.gathered(seen, self._fast)
+
+    def _band_weights(self, constants: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
+        """Return what weights bands so that the contrast sensitivity passes at their frequencies.
+
+        (channels, bands), and, where the luminance is local, what they are multiplied by at
+        `LUMINANCES`, (bands + 1, luminances): A's by the rows of the bands, C1's and C2's by the
+        last.
+        """
+        frequency = constants["band_frequencies"]
+        ones = torch.ones_like(frequency)
+        bright = self._bright(frequency[None], ones[None], constants)[0]
+        # No matrix products, which autocast would round.
+        weights = (constants["band_weights"] * bright.unsqueeze(1)).sum(2)
+        if self.observer.adaptation_luminance is not None:
+            return weights, None
+        # Of the light alone: the eye's own is added to it again.
+        luminances = torch.exp2(ones.new_tensor(LUMINANCES)) - constants["dark_light"]
+        grey = luminances * constants["cones"].sum(1, keepdim=True)
+        at_bands = (part[..., None, None] for part in (ones, frequency, ones, bright))
+        level = Level(*at_bands)
+        chromatic = self.effects.chromatic
+        sensitivity = _sensitivity(grey[None, :, None], level, constants, chromatic)[0, :, :, 0]
+        achromatic = (constants["band_weights"][..., None] * sensitivity[0]).sum(1)
+        dim = sensitivity[-1, 0] / bright[-1, 0]
+        if not chromatic:
+            weights = weights[:0]
+        return torch.cat((ones[None], weights)), torch.cat((achromatic, dim[None]))
 
     def respond(self, cortex: Cortex) -> tuple[Tensor, ...]:
         """Return the responses of one image: chromatic aberration to the transducer.
@@ -464,6 +541,8 @@ class VDM(TiledMetric):
         fast: bool = False,
     ) -> list[Sight]:
         """Return the sight of a level for each image, at the parents, whose lowpass is given."""
+        if self.transform.csf == "filter":
+            return [Sight(None, (1.0 / level.gain)[None, None])] * len(parents)
         look = compiled(_sight) if fast else _sight
         local = self.observer.adaptation_luminance is None
         return [look(parent, level, constants, local, self.effects.chromatic) for parent in parents]
@@ -478,12 +557,28 @@ class VDM(TiledMetric):
             return []
         some = slice(cortex.finest, cortex.finest + count)
         frequency, gain = (constants[name][some].flip(0) for name in ("frequencies", "gains"))
-        if self.effects.aberration:
-            passed = attenuation(
-                frequency[:, 0], constants["aberration_cutoff"], constants["aberration_exponent"]
-            )
-        else:
-            passed = torch.ones_like(frequency[:, :1]).expand(-1, 3)
+        passed = self._passed(frequency[:, 0], constants)
+        bright = self._bright(frequency, gain, constants)
+        # Copies, for compiled code is specialised on the offset of a view.
+        columns = (
+            [row[..., None, None].clone() for row in part]
+            for part in (passed, frequency, gain, bright)
+        )
+        return [Level(*row) for row in zip(*columns, strict=True)]
+
+    def _passed(self, frequency: Tensor, constants: dict[str, Tensor]) -> Tensor:
+        """Return the share (levels, 3) of the cones' details that chromatic aberration leaves."""
+        if not self.effects.aberration:
+            return torch.ones_like(frequency).unsqueeze(1).expand(-1, 3)
+        return attenuation(
+            frequency, constants["aberration_cutoff"], constants["aberration_exponent"]
+        )
+
+    def _bright(self, frequency: Tensor, gain: Tensor, constants: dict[str, Tensor]) -> Tensor:
+        """Return the sensitivity of all channels, or of C1 and C2 where the luminance is local.
+
+        (levels, channels, as many) from (levels, as many); in bright light, over the gain.
+        """
         channels = []
         if self.observer.adaptation_luminance is not None:
             luminance, size = constants["adaptation_luminance"], constants["achromatic_size"]
@@ -493,13 +588,7 @@ class VDM(TiledMetric):
                 butterworth(frequency, *(constants[f"{name}_{part}"] for part in FILTER))
                 for name in ("red_green", "yellow_violet")
             ]
-        bright = torch.stack(channels, 1) / gain.unsqueeze(1) if channels else gain.unsqueeze(1)
-        # Copies, for compiled code is specialised on the offset of a view.
-        columns = (
-            [row[..., None, None].clone() for row in part]
-            for part in (passed, frequency, gain, bright)
-        )
-        return [Level(*row) for row in zip(*columns, strict=True)]
+        return torch.stack(channels, 1) / gain.unsqueeze(1) if channels else gain.unsqueeze(1)
 
 
 def _size(plane: Tensor) -> tuple[int, int]:
@@ -540,7 +629,9 @@ def _response(
     phases: int,
 ) -> Tensor:
     """Return the responses of one level of one image: local contrast to the transducer."""
-    contrast = opponents(local_contrast(details, sight.scale), matrix)
+    contrast = details
+    if sight.scale is not None:
+        contrast = opponents(local_contrast(details, sight.scale), matrix)
     weighted = contrast * sight.sensitivity
     if signed:
         return signed_transducer(weighted, exponent, phases) if masking else weighted
@@ -602,6 +693,57 @@ def _sensitivity(
         return achromatic
     dim = torch.exp2(-constants["chromatic_dimming"] * dark)
     return torch.cat((achromatic, level.sensitivity * dim), 1)
+
+
+def _band_sensitivity(lowpass: Tensor, table: Tensor, constants: dict[str, Tensor]) -> Tensor:
+    """Return the rows of a table at the local luminance, (B, rows, h, w).
+
+    ``lowpass`` is (B, 3, h, w); ``table`` is at `LUMINANCES`, and between them linear.
+    """
+    seen = mix(constants["luminance_of_cones"], lowpass).clamp_min(0.0) + constants["dark_light"]
+    last = len(LUMINANCES) - 1
+    place = (torch.log2(seen[:, 0]) - LUMINANCES[0]).clamp(0.0, last)
+    low = place.detach().floor().clamp_max(last - 1.0)
+    index, rest = low.long(), place - low
+    return torch.stack([torch.lerp(row[:-1][index], row[1:][index], rest) for row in table], 1)
+
+
+def _band_contrast(
+    scale: tuple[Tensor, ...],
+    around: Tensor,
+    passed: Tensor,
+    weights: Tensor,
+    at_places: Tensor | None,
+    dark_cones: Tensor,
+    matrix: Tensor,
+) -> Tensor:
+    """Return the weighted contrast (B, channels, h, w) of the n bands (B, 3, h, w) of a scale.
+
+    ``around`` (B, 3, h, w) is what the eye is adapted to, ``passed`` (n, 3) what chromatic
+    aberration leaves, ``weights`` (channels, n), ``at_places`` (B, n + 1, h, w) what multiplies
+    those of A, and of C1 and C2, where they are local.
+    """
+    adaptation = 1.0 / adapted(around, dark_cones)
+    achromatic: list[Tensor] = []
+    chromatic: list[Tensor] = []
+    for number, band in enumerate(scale):
+        contrast = local_contrast(band.unsqueeze(2), adaptation).squeeze(2)
+        mixing = matrix * passed[number] * weights[:, number, None]
+        # A by itself, for its weights follow the luminance band by band.
+        seen = opponents(contrast, mixing[:1])
+        achromatic.append(seen if at_places is None else seen * at_places[:, number, None])
+        if len(matrix) > 1:
+            chromatic.append(opponents(contrast, mixing[1:]))
+    if not chromatic:
+        return _added(achromatic)
+    colours = _added(chromatic)
+    colours = colours if at_places is None else colours * at_places[:, -1:]
+    return torch.cat((_added(achromatic), colours), 1)
+
+
+def _added(planes: list[Tensor]) -> Tensor:
+    """Return the sum of one plane or two."""
+    return planes[0] if len(planes) == 1 else planes[0] + planes[1]
 
 
 def _pooled_energy(surrounded: Tensor, nodes: int, exponent: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Large images, whose finest levels are computed in bands, against the same image whole."""
+"""Large images, whose finest levels are computed in strips, against the same image whole."""
 
 import pytest
 import torch
@@ -8,13 +8,13 @@ from torch_vdm import VDM, Observer, vdm
 
 OBSERVERS = [Observer.calibrated(), Observer.paper()]
 
-# Bands that divide and that do not, odd sides, an image of one band.
+# Strips that divide and that do not, odd sides, an image of one strip.
 SIZES = [(160, 64), (161, 83), (299, 20), (70, 131), (5, 700)]
 
 
 @pytest.fixture(autouse=True)
-def thin_bands(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vdm, "BAND", 1024)
+def thin_strips(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vdm, "STRIP", 1024)
 
 
 def images(size: tuple[int, int], batch: int = 1) -> tuple[Tensor, Tensor]:
@@ -26,14 +26,14 @@ def images(size: tuple[int, int], batch: int = 1) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("observer", OBSERVERS, ids=lambda o: o.name)
 @pytest.mark.parametrize("size", SIZES, ids=str)
-def test_bands_give_the_map_of_the_whole(
+def test_strips_give_the_map_of_the_whole(
     size: tuple[int, int], observer: Observer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     metric = VDM(observer=observer)
     test, reference = images(size, batch=2)
-    banded = metric(test, reference)
-    monkeypatch.setattr(vdm, "BAND", 2**40)
-    torch.testing.assert_close(banded, metric(test, reference), rtol=1e-12, atol=1e-12)
+    in_strips = metric(test, reference)
+    monkeypatch.setattr(vdm, "STRIP", 2**40)
+    torch.testing.assert_close(in_strips, metric(test, reference), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
@@ -49,13 +49,13 @@ def test_gradients_are_those_of_the_whole_image(monkeypatch: pytest.MonkeyPatch)
     test, reference = images((160, 64))
     test.requires_grad_()
     (gradient,) = torch.autograd.grad(metric.power(test, reference).sum(), test)
-    monkeypatch.setattr(vdm, "BAND", 2**40)
+    monkeypatch.setattr(vdm, "STRIP", 2**40)
     (whole,) = torch.autograd.grad(metric.power(test, reference).sum(), test)
     assert torch.equal(gradient, whole)
     assert torch.count_nonzero(gradient) > 0
 
 
-def test_a_pixel_that_is_not_finite_is_masked_in_its_band() -> None:
+def test_a_pixel_that_is_not_finite_is_masked_in_its_strip() -> None:
     test, reference = images((160, 64))
     reference[0, 1, 100, 7] = torch.nan
     jnd = VDM(nonfinite="mask")(test, reference)
