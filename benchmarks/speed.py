@@ -115,7 +115,7 @@ def run(quick: bool, output: Path | None) -> None:
         _plot(result, output / "speed.png")
 
 
-def _images(size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def images(size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(1)
     reference = torch.rand(1, 3, *size, generator=generator)
     noise = 0.05 * torch.randn(reference.shape, generator=generator)
@@ -134,7 +134,7 @@ def _interleaved(
     makers: dict[str, Callable[[], Contender]], size: tuple[int, int], rounds: int
 ) -> dict[str, float]:
     """Return each contender's median seconds, in interleaved runs."""
-    test, reference = _images(size)
+    test, reference = images(size)
     contenders = {name: maker() for name, maker in makers.items()}
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     for number in range(rounds + 2):
@@ -179,20 +179,20 @@ def _measure(what: str, name: str, size: tuple[int, int]) -> dict[str, float]:
     """Return the seconds of a first call, or its peak of memory over what stood before."""
     torch.set_num_threads(THREADS)
     contender = CONTENDERS[name]()
-    test, reference = _images(size)
+    test, reference = images(size)
     if what == "first":
         start = time.perf_counter()
         _once(name, contender, test, reference)
         return {"seconds": time.perf_counter() - start}
     # Imports, thread pools and compilation are not the metric's working memory.
-    _once(name, contender, *_images((96, 160)))
+    _once(name, contender, *images((96, 160)))
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-    before = _status("VmRSS")
+    before = status("VmRSS")
     _once(name, contender, test, reference)
-    return {"megabytes": (_status("VmHWM") - before) / 1e3}
+    return {"megabytes": (status("VmHWM") - before) / 1e3}
 
 
-def _status(field: str) -> float:
+def status(field: str) -> float:
     """Return a field of /proc/self/status in kilobytes."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(field):

@@ -1,4 +1,4 @@
-"""StationaryHaar and Steerable in NumPy, node by node, from their descriptions in docs/model.md.
+"""StationaryHaar, Steerable and the filter in NumPy, node by node, as docs/model.md has them.
 
 Planes are (H, W); details are (orientations, h, w), the finest level first. Every node is summed up
 by itself, over the pixels or samples that it covers; an image goes on beyond its border as its last
@@ -6,6 +6,7 @@ row and column.
 """
 
 import math
+from functools import cache
 
 import numpy as np
 
@@ -97,6 +98,135 @@ def diagonal_peak(level: int) -> tuple[float, float]:
     wavelet, window = haar_responses(level, frequency / math.sqrt(2.0))
     others = 2.0 * (wavelet * window / best) ** 4
     return math.sqrt(2.0) * frequency, wavelet**2 / (1.0 - others) ** 0.25
+
+
+@cache
+def diagonal_share() -> float:
+    """Return d3's gain over d1's, for a filtered image: all directions as strong over an octave.
+
+    A grating and its like at 45 degrees, on coarse levels; powers of 4, summed over all levels.
+    """
+    straight = less = diagonal = 0.0
+    for place in range(16):
+        frequency = 2.0 ** (place / 16 - 5.0)
+        for level in range(8):
+            gain = wavelet_peak(2**level)[1]
+            straight += (haar_responses(level, frequency)[0] / gain) ** 4
+            wavelet, window = haar_responses(level, frequency / math.sqrt(2.0))
+            less += 2.0 * (wavelet * window / gain) ** 4
+            diagonal += (wavelet**2 / gain) ** 4
+    return float((diagonal / (straight - less)) ** 0.25)
+
+
+# The Laplacian pyramid of a filtered image, its lowpass, and that of its finest octave.
+SEVEN = np.array([1.0, 6.0, 15.0, 20.0, 15.0, 6.0, 1.0]) / 64.0
+THREE = np.array([1.0, 2.0, 1.0]) / 4.0
+BANDS = 25
+
+
+def mirrored(i: int, side: int, reach: int) -> int:
+    """Return the place of a sample beyond a border, as a kernel of so many on a side sees it."""
+    if side <= reach:
+        return min(max(i, 0), side - 1)
+    i = abs(i)
+    return i if i < side else 2 * (side - 1) - i
+
+
+def smoothed(plane: Array, kernel: Array) -> Array:
+    """Return the correlation with a kernel along rows and columns; borders are mirrored."""
+    for _ in range(2):
+        reach = len(kernel) // 2
+        side = plane.shape[1]
+        rows = np.zeros_like(plane)
+        for x in range(side):
+            for tap, weight in enumerate(kernel):
+                rows[:, x] += weight * plane[:, mirrored(x + tap - reach, side, reach)]
+        plane = rows.T
+    return plane
+
+
+def between(plane: Array, shape: tuple[int, ...]) -> Array:
+    """Return a plane at the next finer size: zeros between its samples, smoothed, times 4."""
+    for side in (shape[0], shape[1]):
+        finer = np.zeros((side, plane.shape[1]))
+        for y in range(side):
+            for tap in range(7):
+                sample = y + tap - 3
+                if sample % 2 == 0:
+                    at_sample = mirrored(sample // 2, plane.shape[0], 2)
+                    finer[y] += 2.0 * SEVEN[tap] * plane[at_sample]
+        plane = finer.T
+    return plane
+
+
+def band_share(band: int, cycles: float) -> float:
+    """Return what a band has of a grating, cycles/pixel, by transforming the kernels."""
+    parted = transfer(THREE, cycles)
+    if band == 0:
+        return 1.0 - parted
+    passed = parted
+    for scale in range(band):
+        again = transfer(SEVEN, cycles * 2.0**scale) ** 2 if cycles * 2.0**scale < 0.5 else 0.0
+        if scale < band - 1:
+            passed *= again
+    return passed * (1.0 - again)
+
+
+def weighted_contrast(image: Array, ppd: float, parameters: CalibratedParameters) -> Array:
+    """Return the weighted contrast (3, H, W) of A, C1, C2, the filtered image (3, H, W), XYZ.
+
+    Bands are weighted by what makes gratings of their frequencies pass with their sensitivity, at
+    every whole octave of luminance between 2^-8 and 2^17 cd/m2 and linearly between.
+    """
+    p = parameters
+    frequencies = ppd * np.array(
+        [0.5, 0.1764, *(0.0775 / 2.0**scale for scale in range(BANDS - 2))]
+    )
+    shares = [[band_share(band, float(f) / ppd) for band in range(BANDS)] for f in frequencies]
+    octaves = np.arange(-8, 18)
+    curves = np.array(
+        [[sensitivity(float(f), 2.0**octave, p) for octave in octaves] for f in frequencies]
+    )
+    table = np.einsum("bf,foc->boc", np.linalg.inv(np.array(shares)), curves)
+    sml_to_y = np.linalg.inv(XYZ_TO_SML)[1]
+    dark = cone_dark_light(p.dark_light)
+
+    here = cone_fundamentals(image)
+    scales: list[list[tuple[int, Array]]] = []
+    lowpass = []
+    for scale in range(level_count(*image.shape[1:])):
+        bands = []
+        if scale == 0:
+            smooth = np.stack([smoothed(cone, THREE) for cone in here])
+            bands.append((0, here - smooth))
+            here = smooth
+        coarse = np.stack([smoothed(cone, SEVEN)[::2, ::2] for cone in here])
+        around = np.stack([between(cone, here.shape[1:]) for cone in coarse])
+        bands.append((scale + 1, here - around))
+        scales.append(bands)
+        lowpass.append((coarse, around))
+        here = coarse
+
+    total = np.zeros((3, 1, 1))
+    for bands, (coarse, around) in zip(reversed(scales), reversed(lowpass), strict=True):
+        shape = around.shape[1:]
+        whole = np.stack([between(channel, shape) for channel in total])
+        for band, plane in bands:
+            weights = np.zeros((3, *coarse.shape[1:]))
+            for y, x in np.ndindex(coarse.shape[1:]):
+                luminance = max(float(sml_to_y @ coarse[:, y, x]), 0.0) + p.dark_light
+                for channel in range(3):
+                    weights[channel, y, x] = np.interp(
+                        math.log2(luminance), octaves, table[band, :, channel]
+                    )
+            weights = np.stack([between(channel, shape) for channel in weights])
+            contrast = plane / (np.maximum(around, 0.0) + dark[:, None, None])
+            contrast[0] *= aberration_factor(
+                frequencies[band], p.aberration_cutoff, p.aberration_exponent
+            )
+            whole += weights * np.einsum("ij,jhw->ihw", SML_TO_OPPONENT, contrast)
+        total = whole
+    return np.broadcast_to(total, image.shape)
 
 
 def halfway_weights() -> Array:
@@ -208,6 +338,16 @@ def level_responses(
 
     ``peaks`` are frequency, cycles/pixel, and gain of every level, for d3 those of `diagonal_peak`.
     """
+    q = parameters.transducer_exponent
+    if kind == "filtered":
+        planes = [stationary_haar(seen) for seen in weighted_contrast(image, ppd, parameters)]
+        responses = []
+        for level in range(len(planes[0])):
+            weighted = np.stack([channel[level][0] for channel in planes], axis=1)
+            weighted /= wavelet_peak(2**level)[1]
+            weighted[2] /= diagonal_share()
+            responses.append(2.0**q * weighted / (1.0 + weighted**2) ** q)
+        return responses
     cones = cone_fundamentals(image)
     dark = cone_dark_light(parameters.dark_light)
     sml_to_y = np.linalg.inv(XYZ_TO_SML)[1]
@@ -240,7 +380,6 @@ def level_responses(
         if kind == "steerable":
             for even in range(0, 8, 2):
                 energy[even : even + 2] = energy[even] + energy[even + 1]
-        q = parameters.transducer_exponent
         responses.append(2.0**q * weighted / (1.0 + energy) ** q)
     return responses
 

@@ -7,18 +7,44 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torch_vdm.cortex.transform import Cortex, mean_of
+from torch_vdm.cortex.transform import CSF, DEEPEST, Cortex, checked_csf, mean_of
 from torch_vdm.fast import SMALLEST, compiled
 from torch_vdm.quadtree import complete, own, pad_even
+
+# The exponent of the sum over coefficients by which a diagonal grating is made as strong as a
+# vertical one; that of the detection score. Status: choice.
+EXPONENT = 4.0
+
+# Gratings over the octave for which they are made so, from this frequency in cycles/pixel, and the
+# levels that see them.
+OCTAVE, LOWEST, SEEING = 16, 1 / 32, 8
 
 
 @dataclass(frozen=True)
 class Haar:
-    """The paper's transform: O(N), one coefficient a pixel and cone, not shift-invariant."""
+    """The paper's transform: O(N), one coefficient a pixel and cone, not shift-invariant.
+
+    Parameters
+    ----------
+    csf
+        Where contrast sensitivity acts. "levels": on the coefficients, at each level's frequency,
+        as in the paper. "filter": on the image before its decomposition, at every frequency.
+
+    Raises
+    ------
+    ValueError
+        Where ``csf`` is neither.
+    """
+
+    csf: CSF = "levels"
 
     shifts = 1
     phases = 1
     reach = 1
+
+    def __post_init__(self) -> None:
+        """Refuse what is no option."""
+        checked_csf(self.csf)
 
     def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:
         """Decompose (B, C, H, W) by Eq. 2 down to one node, by compiled steps if ``fast``.
@@ -36,12 +62,20 @@ class Haar:
         details, lowpass = levels(planes, 1, size, fast, true_means)
         return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [planes])), mean)
 
+    def begin(
+        self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
+    ) -> Cortex:
+        """Return the ``count`` finest levels of `decompose`, without a mean; arguments as there."""
+        size = (planes.shape[-2], planes.shape[-1])
+        details, lowpass = levels(planes, 1, size, fast, true_means, count)
+        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass)), planes[..., :1, :1])
+
     def reduced(
         self, planes: Tensor, octaves: int, fast: bool = False, true_means: bool = False
     ) -> Tensor:
         """Return the means of nodes of 2^octaves pixels; arguments as `decompose`."""
         size = (planes.shape[-2], planes.shape[-1])
-        return [planes, *levels(planes, 1, size, fast, true_means)[1]][octaves]
+        return [planes, *levels(planes, 1, size, fast, true_means, octaves)[1]][octaves]
 
     def resume(
         self,
@@ -53,31 +87,58 @@ class Haar:
         true_means: bool = False,
     ) -> Cortex:
         """Decompose what `reduced` gives; see `Transform.resume`."""
+        # The first step is a level that tiles have.
+        _, (plane,) = levels(plane, 2**octaves, size, fast, true_means, 1)
+        return self.coarser(plane, octaves + 1, size, mean, fast, true_means)
+
+    def coarser(
+        self,
+        plane: Tensor,
+        octaves: int,
+        size: tuple[int, int],
+        mean: Tensor,
+        fast: bool = False,
+        true_means: bool = False,
+    ) -> Cortex:
+        """Return the levels of `decompose` without its ``octaves`` finest.
+
+        ``plane`` has the means of nodes of 2^octaves pixels; other arguments as in `resume`.
+        """
         details, lowpass = levels(plane, 2**octaves, size, fast, true_means)
-        # The first of them is a level that tiles have.
-        coarser = tuple(reversed(details[1:])), tuple(reversed(lowpass[1:]))
-        return Cortex(*coarser, mean, octaves + 1)
+        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass)), mean, octaves)
 
     def peak(self, level_from_finest: int) -> tuple[float, float]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there."""
         return _peak(level_from_finest)
 
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
-        """Return the same, for all three orientations."""
-        return (_peak(level_from_finest),)
+        """Return the same, for all three orientations.
+
+        For a filtered image d3 has the gain that makes up for what d1 and d2 have less of a
+        diagonal grating; on the paper's levels it has theirs.
+        """
+        frequency, gain = _peak(level_from_finest)
+        if self.csf == "levels":
+            return ((frequency, gain),)
+        return (frequency, gain), (frequency, gain), (frequency, gain * diagonal_share())
 
 
 def levels(
-    planes: Tensor, node: int, size: tuple[int, int], fast: bool, true_means: bool
+    planes: Tensor,
+    node: int,
+    size: tuple[int, int],
+    fast: bool,
+    true_means: bool,
+    count: int = DEEPEST,
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Return details and lowpass of every level of the means of nodes, the finest first.
+    """Return details and lowpass of the ``count`` finest levels, the finest first.
 
     ``planes`` (B, C, h, w) are the means of nodes of ``node`` x ``node`` pixels of an image of
     ``size`` = (H, W) pixels.
     """
     details: list[Tensor] = []
     lowpass: list[Tensor] = []
-    while max(planes.shape[-2:]) > 1:
+    while max(planes.shape[-2:]) > 1 and len(details) < count:
         step = compiled(_analyse) if fast and planes.numel() >= SMALLEST else _analyse
         if true_means:
             mean_of_all, detail = step(complete(planes, size, node))
@@ -117,3 +178,35 @@ def _peak(level_from_finest: int) -> tuple[float, float]:
         slope = 2.0 * m * math.sin(once) * math.cos(many) - math.cos(once) * math.sin(many)
         low, high = (middle, high) if slope > 0.0 else (low, middle)
     return low, math.sin(math.pi * m * low) ** 2 / (m * math.sin(math.pi * low))
+
+
+def wavelet_response(half: int, frequency: float) -> float:
+    """Return what a wavelet of 2 ``half`` pixels leaves of a grating, cycles/pixel."""
+    return math.sin(math.pi * half * frequency) ** 2 / (half * math.sin(math.pi * frequency))
+
+
+def window_response(half: int, frequency: float) -> float:
+    """Return what the mean of 2 ``half`` pixels leaves of a grating, cycles/pixel."""
+    turn = math.pi * frequency
+    return math.sin(2 * half * turn) / (2 * half * math.sin(turn))
+
+
+@lru_cache
+def diagonal_share() -> float:
+    """Return d3's gain over that of d1 and d2 with which all directions are as strong.
+
+    A grating of equal sensitivity on all levels is decomposed at 0 and at 45 degrees; the sums over
+    all coefficients, to the power of EXPONENT, are equal on average over an octave. Of coarse
+    levels, which are alike.
+    """
+    straight = less = diagonal = 0.0
+    for place in range(OCTAVE):
+        frequency = 2.0 ** (place / OCTAVE) * LOWEST
+        along = frequency / math.sqrt(2.0)
+        for level in range(SEEING):
+            half, gain = 2**level, _peak(level)[1]
+            straight += (wavelet_response(half, frequency) / gain) ** EXPONENT
+            wavelet = wavelet_response(half, along) / gain
+            less += 2.0 * (wavelet * window_response(half, along)) ** EXPONENT
+            diagonal += (wavelet * wavelet_response(half, along)) ** EXPONENT
+    return float((diagonal / (straight - less)) ** (1.0 / EXPONENT))

@@ -9,14 +9,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.cortex.haar import Haar, levels
-from torch_vdm.cortex.transform import Cortex, mean_of
+from torch_vdm.cortex.haar import (
+    EXPONENT,
+    Haar,
+    levels,
+    wavelet_response,
+    window_response,
+)
+from torch_vdm.cortex.transform import CSF, Cortex, checked_csf, mean_of
 from torch_vdm.fast import SMALLEST, compiled
 from torch_vdm.quadtree import share
-
-# The exponent of the sum over orientations by which a diagonal grating is made as strong as a
-# vertical one; that of the detection score. Status: choice.
-EXPONENT = 4.0
 
 
 @dataclass(frozen=True)
@@ -31,11 +33,27 @@ class StationaryHaar:
 
     The paper's plane d3 is tuned to diagonal gratings; it has the frequency and the gain that it
     has for these.
+
+    Parameters
+    ----------
+    csf
+        As in `Haar`.
+
+    Raises
+    ------
+    ValueError
+        As in `Haar`.
     """
+
+    csf: CSF = "levels"
 
     shifts = 2
     phases = 1
     reach = 5
+
+    def __post_init__(self) -> None:
+        """Refuse what is no option."""
+        checked_csf(self.csf)
 
     def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:
         """Decompose (B, C, H, W) to the coarsest level; arguments as `Haar.decompose`.
@@ -77,7 +95,12 @@ class StationaryHaar:
         return _cortex(parts, octaves + 1, size, mean, fast, true_means)
 
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
-        """Return the best frequency, cycles/pixel, and its gain for d1, d2 and d3."""
+        """Return the best frequency, cycles/pixel, and its gain for d1, d2 and d3.
+
+        For a filtered image those of `Haar`.
+        """
+        if self.csf == "filter":
+            return Haar("filter").peaks(level_from_finest)
         return _peaks(level_from_finest)
 
 
@@ -185,9 +208,8 @@ def _peaks(level_from_finest: int) -> tuple[tuple[float, float], ...]:
     """
     frequency, gain = Haar().peak(level_from_finest)
     half = 2**level_from_finest
-    turn = math.pi * frequency / math.sqrt(2.0)
-    wavelet = math.sin(half * turn) ** 2 / (half * math.sin(turn))
-    window = math.sin(2 * half * turn) / (2 * half * math.sin(turn))
+    along = frequency / math.sqrt(2.0)
+    wavelet, window = wavelet_response(half, along), window_response(half, along)
     others = 2.0 * (wavelet * window / gain) ** EXPONENT
     diagonal = wavelet**2 / (1.0 - others) ** (1.0 / EXPONENT)
     return (frequency, gain), (frequency, gain), (math.sqrt(2.0) * frequency, diagonal)

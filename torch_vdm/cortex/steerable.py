@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from torch_vdm.cortex import oriented
 from torch_vdm.cortex.gaussian import blur, lowpass_response, step
-from torch_vdm.cortex.transform import DEEPEST, Cortex, mean_of
+from torch_vdm.cortex.transform import CSF, DEEPEST, Cortex, mean_of
 from torch_vdm.fast import SMALLEST
 
 # The image half-way between its pixels, which the finest level needs: a sinc of so many taps on
@@ -55,6 +55,8 @@ class Steerable:
     length of the difference of their pairs, which no phase changes.
     """
 
+    # Its bands are narrow: no level sees gratings of other levels.
+    csf: ClassVar[CSF] = "levels"
     shifts = 2
     phases = 2
     reach = 12

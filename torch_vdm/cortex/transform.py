@@ -1,11 +1,20 @@
 """What every cortex transform is held to."""
 
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 from torch import Tensor
 
 # Levels that constants are made for: an image of 2^24 pixels a side.
 DEEPEST = 24
+
+# Where contrast sensitivity acts: on the levels of a transform, or on the image before it.
+CSF = Literal["levels", "filter"]
+
+
+def checked_csf(csf: str) -> None:
+    """Raise ValueError where ``csf`` is none of the two."""
+    if csf not in ("levels", "filter"):
+        raise ValueError(f'expected csf "levels" or "filter", got {csf!r}')
 
 
 class Cortex(NamedTuple):
@@ -45,6 +54,15 @@ class Transform(Protocol):
         1: nodes lie side by side, the finest 2 pixels wide, and the quad-tree is the paper's. 2:
         they overlap, and the quad-tree is that of the halves of nodes, whose leaves are the pixels.
         The half of a node (y, x) is covered by the nodes y - 1 and y, x - 1 and x.
+        """
+
+    @property
+    def csf(self) -> CSF:
+        """Where contrast sensitivity acts.
+
+        "levels": on the details, at each level's frequency. "filter": on the image, at every
+        frequency; what is decomposed is then no light but weighted contrast, A, C1 and C2 for the
+        cones, and a level only divides it by its gains.
         """
 
     @property

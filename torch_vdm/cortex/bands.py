@@ -1,0 +1,173 @@
+"""Smooth frequency bands of an image, which add up to it: what filters it by contrast sensitivity.
+
+A Laplacian pyramid (Burt and Adelson 1983) whose finest octave is parted once more, at the image's
+own density: an eye's sensitivity falls too fast over the two octaves that its first band has.
+Weighted band by band, with weights that may differ from place to place, and gathered again, an
+image is filtered by whatever the weights follow, such as the local luminance.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from torch_vdm.cortex.gaussian import along, response, step
+from torch_vdm.cortex.transform import DEEPEST
+
+# Weights of the lowpass that parts the finest octave: half is left at a quarter of a cycle a pixel.
+# Status: choice.
+PARTING = (0.25, 0.5, 0.25)
+
+# Weights of the pyramid's lowpass, cos(pi f)^6: Burt and Adelson's five taps leave aliases that
+# move a threshold by 2 dB with the phase of a grating. Status: choice, measured.
+LOWPASS = (1 / 64, 6 / 64, 15 / 64, 20 / 64, 15 / 64, 6 / 64, 1 / 64)
+
+# Where the weights of the second and the third band are settled, in cycles/pixel; that of each next
+# one at half of it. About what these bands have most of. Status: choice.
+SECOND, NEXT = 0.1764, 0.0775
+
+# Bands that constants are made for.
+MOST = DEEPEST + 1
+
+
+class Bands(NamedTuple):
+    """The bands of a batch of planes, the finest first.
+
+    Attributes
+    ----------
+    planes
+        The bands of every scale, (B, C, h, w): one, but two of the first. The first is of the
+        image's size, each next one of half its sides, rounded up. None for an image of one pixel.
+    around
+        One (B, C, h, w) a scale: the lowpass at the same places, without all bands so far.
+    next
+        The same, (B, C, ceil(h / 2), ceil(w / 2)), before it is brought to these places.
+    """
+
+    planes: tuple[tuple[Tensor, ...], ...]
+    around: tuple[Tensor, ...]
+    next: tuple[Tensor, ...]
+
+
+def parted(image: Tensor, fast: bool = False) -> Bands:
+    """Part (B, C, H, W) into bands, by compiled steps if ``fast``."""
+    planes: list[tuple[Tensor, ...]] = []
+    around: list[Tensor] = []
+    lowpass: list[Tensor] = []
+    here = image
+    for _ in range((max(image.shape[-2:]) - 1).bit_length()):
+        finer = here
+        if not planes:
+            rows = step(_parted_rows, image, fast)(image)
+            here = step(_parted_columns, image, fast)(rows)
+        lowpass.append(reduced(here, fast))
+        around.append(expanded(lowpass[-1], (here.shape[-2], here.shape[-1]), fast))
+        band = here - around[-1]
+        planes.append((band,) if planes else (finer - here, band))
+        here = lowpass[-1]
+    return Bands(tuple(planes), tuple(around), tuple(lowpass))
+
+
+def gathered(planes: Sequence[Tensor], fast: bool = False) -> Tensor:
+    """Add up one plane (B, C, h, w) a scale, the finest first, to one of the finest size."""
+    total = planes[-1]
+    for plane in reversed(planes[:-1]):
+        total = plane + expanded(total, (plane.shape[-2], plane.shape[-1]), fast)
+    return total
+
+
+def reduced(plane: Tensor, fast: bool = False) -> Tensor:
+    """Return the next coarser plane: every second sample, ceil(h / 2) x ceil(w / 2) of them."""
+    rows = step(_reduced_rows, plane, fast)(plane)
+    columns: Tensor = step(_reduced_columns, plane, fast)(rows)
+    return columns
+
+
+def expanded(plane: Tensor, size: tuple[int, int], fast: bool = False) -> Tensor:
+    """Return a plane at the ``size`` of the next finer one, smooth between its own samples."""
+    columns = step(_expanded_columns, plane, fast)(plane, size[0])
+    rows: Tensor = step(_expanded_rows, plane, fast)(columns, size[1])
+    return rows
+
+
+def surrounded(plane: Tensor, width: int, dim: int) -> Tensor:
+    """Continue a plane by ``width`` samples on both sides: mirrored, or repeated where short.
+
+    A repeated border gives a grating another mean beyond it, which is seen.
+    """
+    sides = (width, width, 0, 0) if dim == -1 else (0, 0, width, width)
+    mode = "reflect" if plane.shape[dim] > width else "replicate"
+    return functional.pad(plane, sides, mode=mode)
+
+
+def _parted_rows(plane: Tensor) -> Tensor:
+    return along(surrounded(plane, 1, -1), PARTING, -1)
+
+
+def _parted_columns(plane: Tensor) -> Tensor:
+    return along(surrounded(plane, 1, -2), PARTING, -2)
+
+
+def _reduced_rows(plane: Tensor) -> Tensor:
+    return along(surrounded(plane, 3, -1), LOWPASS, -1, 2)
+
+
+def _reduced_columns(plane: Tensor) -> Tensor:
+    return along(surrounded(plane, 3, -2), LOWPASS, -2, 2)
+
+
+def _expanded_rows(plane: Tensor, width: int) -> Tensor:
+    return _expanded(plane, -1).flatten(-2)[..., :width]
+
+
+def _expanded_columns(plane: Tensor, height: int) -> Tensor:
+    return _expanded(plane, -2).flatten(-3, -2)[..., :height, :]
+
+
+def _expanded(plane: Tensor, dim: int) -> Tensor:
+    """Return what lies at the samples of a plane and after each, stacked at ``dim``."""
+    length = plane.shape[dim]
+    padded = surrounded(plane, 2, dim)
+    before, here, after, far = (padded.narrow(dim, tap, length) for tap in (1, 2, 3, 4))
+    even = (2.0 * LOWPASS[3]) * here + (2.0 * LOWPASS[1]) * (before + after)
+    odd = (2.0 * LOWPASS[2]) * (here + after) + (2.0 * LOWPASS[0]) * (before + far)
+    return torch.stack((even, odd), dim)
+
+
+def share(band: int, frequency: float) -> float:
+    """Return what of a grating of ``frequency`` cycles/pixel a band has, once gathered.
+
+    0 is the finest, and all add up to 1. Every reduction and expansion passes the grating once
+    each; what aliases is not counted.
+    """
+    left = math.cos(math.pi * frequency) ** 2
+    if band == 0:
+        return 1.0 - left
+    for scale in range(band):
+        cycles = 2.0**scale * frequency
+        passed = response(LOWPASS, cycles) ** 2 if cycles < 0.5 else 0.0
+        if scale == band - 1:
+            return left * (1.0 - passed)
+        left *= passed
+    raise AssertionError
+
+
+def frequencies() -> tuple[float, ...]:
+    """Return the frequency in cycles/pixel at which each band's weight is settled."""
+    return (0.5, SECOND, *(NEXT / 2.0**scale for scale in range(MOST - 2)))
+
+
+@lru_cache
+def weights() -> tuple[tuple[float, ...], ...]:
+    """Return the matrix that makes weights of bands of what a filter is to pass.
+
+    It takes what is to pass at `frequencies`, and undoes that a band has something of its
+    neighbours' frequencies too: with these weights exactly that passes there.
+    """
+    shares = [[share(band, frequency) for band in range(MOST)] for frequency in frequencies()]
+    inverse = torch.linalg.inv(torch.tensor(shares, dtype=torch.float64))
+    return tuple(tuple(row) for row in inverse.tolist())
