@@ -28,6 +28,9 @@ FULL_HD = (1080, 1920)
 SIZES = ((512, 512), (1024, 1024), FULL_HD, (2160, 3840))
 QUICK_SIZES = ((128, 128), (192, 256))
 
+# What a training step has.
+BATCH, PATCH = 4, (256, 256)
+
 Contender = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -76,12 +79,46 @@ def compiled_loss() -> Contender:
     return VDMLoss().compile()
 
 
+def torchmetrics_ssim() -> Contender:
+    """Torchmetrics' SSIM with a window of 11 pixels, as a loss."""
+    from torchmetrics.functional.image import structural_similarity_index_measure as similarity
+
+    def loss(test: Tensor, reference: Tensor) -> Tensor:
+        value = similarity(test, reference, kernel_size=11, data_range=1.0)
+        assert isinstance(value, Tensor)
+        return 1.0 - value
+
+    return loss
+
+
+def piq_ssim() -> Contender:
+    """The SSIM loss of piq with its window of 11 pixels."""
+    from piq import SSIMLoss
+
+    loss = SSIMLoss()
+    return lambda test, reference: loss(test, reference)
+
+
+def pytorch_msssim() -> Contender:
+    """The SSIM of pytorch-msssim with its window of 11 pixels, as a loss."""
+    from pytorch_msssim import ssim
+
+    return lambda test, reference: 1.0 - ssim(test, reference, data_range=1.0)
+
+
 FORWARD = {"kornia SSIM": ssim, "VDM": eager, "VDM compiled": compiled, "VDM paper": paper}
 BACKWARD = {
     "kornia SSIM loss": ssim_loss,
     "VDMLoss": eager_loss,
     "VDMLoss checkpoint": checkpointed_loss,
     "VDMLoss compiled": compiled_loss,
+}
+# Of other packages, in the extra "peers"; one that is missing is named. Slower metrics, cvvdp and
+# FLIP among them, are timed by the benchmark "accuracy".
+PEERS = {
+    "torchmetrics SSIM loss": torchmetrics_ssim,
+    "piq SSIM loss": piq_ssim,
+    "pytorch-msssim loss": pytorch_msssim,
 }
 CONTENDERS = FORWARD | BACKWARD
 COMPILED = ("VDM compiled", "VDMLoss compiled")
@@ -96,6 +133,11 @@ def run(quick: bool, output: Path | None) -> None:
     result: dict[str, Any] = {**circumstances(), "size": size, "rounds": rounds}
     result["forward_seconds"] = _interleaved(FORWARD, size, rounds)
     result["backward_seconds"] = _interleaved(BACKWARD, size, rounds)
+    installed = {name: maker for name, maker in PEERS.items() if _installed(maker)}
+    result["missing"] = [name for name in PEERS if name not in installed]
+    batch = (BATCH, *(QUICK_SIZES[0] if quick else PATCH))
+    result["batch"] = batch
+    result["batch_seconds"] = _interleaved(BACKWARD | installed, batch[1:], rounds, BATCH)
     result["forward_seconds_by_size"] = {
         f"{width}x{height}": _interleaved(
             {name: FORWARD[name] for name in ("VDM", "VDM compiled")}, (height, width), rounds
@@ -115,11 +157,19 @@ def run(quick: bool, output: Path | None) -> None:
         _plot(result, output / "speed.png")
 
 
-def images(size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def images(size: tuple[int, int], batch: int = 1) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(1)
-    reference = torch.rand(1, 3, *size, generator=generator)
+    reference = torch.rand(batch, 3, *size, generator=generator)
     noise = 0.05 * torch.randn(reference.shape, generator=generator)
     return (reference + noise).clamp(0.0, 1.0), reference
+
+
+def _installed(maker: Callable[[], Contender]) -> bool:
+    try:
+        maker()
+    except ImportError:
+        return False
+    return True
 
 
 def _once(name: str, contender: Contender, test: Tensor, reference: Tensor) -> None:
@@ -131,10 +181,13 @@ def _once(name: str, contender: Contender, test: Tensor, reference: Tensor) -> N
 
 
 def _interleaved(
-    makers: dict[str, Callable[[], Contender]], size: tuple[int, int], rounds: int
+    makers: dict[str, Callable[[], Contender]],
+    size: tuple[int, int],
+    rounds: int,
+    batch: int = 1,
 ) -> dict[str, float]:
     """Return each contender's median seconds, in interleaved runs."""
-    test, reference = images(size)
+    test, reference = images(size, batch)
     contenders = {name: maker() for name, maker in makers.items()}
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     for number in range(rounds + 2):
@@ -219,7 +272,14 @@ def _table(result: dict[str, Any]) -> str:
             memory = result["peak_extra_megabytes"].get(name, math.nan)
             lines.append(f"| {name} | {seconds:.3f} | {ratio:.2f} | {memory:.0f} |")
     lines += ["", f"The lower {len(BACKWARD)}: forward and backward.", ""]
-    lines += ["| size | VDM, ns a pixel | VDM compiled, ns a pixel |", "|---|---|---|"]
+    batch = " x ".join(map(str, (result["batch"][0], 3, *result["batch"][1:])))
+    lines += [f"Forward and backward, {batch}:", "", "| | seconds | to kornia |", "|---|---|---|"]
+    for name, seconds in result["batch_seconds"].items():
+        ratio = seconds / result["batch_seconds"]["kornia SSIM loss"]
+        lines.append(f"| {name} | {seconds:.3f} | {ratio:.2f} |")
+    if result["missing"]:
+        lines += ["", f"Not installed: {', '.join(result['missing'])}."]
+    lines += ["", "| size | VDM, ns a pixel | VDM compiled, ns a pixel |", "|---|---|---|"]
     for size, seconds in result["forward_seconds_by_size"].items():
         wide, high = map(int, size.split("x"))
         cells = " | ".join(f"{1e9 * value / (wide * high):.0f}" for value in seconds.values())
