@@ -75,6 +75,23 @@ def test_a_dark_pixel_beside_a_bright_one_keeps_its_scale() -> None:
     assert (shrunk[:, :8] / truth[:, :8]).max() < 10.0
 
 
+def test_rare_light_is_known_across_the_border_of_a_large_node() -> None:
+    """A row of pixels above the middle, lit as those below: they alone in their half of the tree.
+
+    With 1 event in 1000 samples and 500 samples a pixel, five pixels have seen nothing in 8 % of
+    runs; without their neighbours across the border they were left at 1e-4 of their variance.
+    """
+    light = np.zeros((32, 32, 3))
+    light[15:22, 10:20] = 0.003
+    chance = np.full((32, 32), 0.001)
+    found = []
+    for seed in range(12):
+        renderer = Synthetic(0.0 * light, light, chance, seed)
+        shrunk = green(pooled_covariance(drawn(renderer, 500), renderer.size))
+        found.append(shrunk[15, 10:20].min() / renderer.covariance[15, 15, 1, 1])
+    assert min(found) > 0.1
+
+
 def test_it_scales_with_the_radiance() -> None:
     samples = wall(0.1).sample(np.arange(256), np.zeros(256, np.int64), np.full(256, 16))
     found = []
@@ -103,3 +120,43 @@ def test_it_is_a_covariance() -> None:
     for row, (one, other) in enumerate(zip(FIRST, SECOND, strict=True)):
         matrices[:, one, other] = matrices[:, other, one] = shrunk[row].reshape(-1)
     assert np.linalg.eigvalsh(matrices).min() > 0.0
+
+
+def test_a_saturated_colour_does_not_scale_its_parents_variance_without_bound() -> None:
+    # Red or green by chance, and never both: some pixels have seen one of them alone, and their
+    # other channel is 0 but for rounding.
+    size, count = (32, 32), 16
+    red, green = np.zeros((*size, 3)), np.zeros((*size, 3))
+    red[..., 0], green[..., 1] = 1.0, 0.297
+    renderer = Synthetic(red, green - red, np.full(size, 0.5), 3)
+    pixels = np.arange(size[0] * size[1])
+    statistics = Statistics(len(pixels))
+    statistics.add(renderer.sample(pixels, 0 * pixels, 0 * pixels + count))
+    pooled = pooled_covariance(statistics, size)[FIRST == SECOND]
+    true = renderer.covariance[0, 0].diagonal()
+    # No pixel's estimate is over what a single one could see, p (1 - p) at p = 1/2, but for the
+    # scale by which its mean may exceed the others'.
+    assert (pooled.mean((1, 2)) <= 1.2 * true + 1e-12).all()
+    assert (pooled.max((1, 2)) <= 4.0 * true + 1e-12).all()
+
+
+def test_a_black_background_beside_a_seldom_hit_light_is_known_to_be_black() -> None:
+    # A half that one sample in ten lights, and one that is black.
+    size, count = (32, 32), 64
+    lit = np.zeros((*size, 3))
+    lit[:, :16] = 1.0
+    renderer = Synthetic(np.zeros_like(lit), lit, np.full(size, 0.1), 5)
+    pixels = np.arange(size[0] * size[1])
+    statistics = Statistics(len(pixels))
+    statistics.add(renderer.sample(pixels, 0 * pixels, 0 * pixels + count))
+    pooled = pooled_covariance(statistics, size)[0]
+    true = renderer.covariance[0, 0, 0, 0]
+    assert pooled[:, :16].mean() == pytest.approx(true, rel=0.1)
+    # Blocks of black pixels have not been hit where as many beside them were, hundreds of times;
+    # those at the border are still doubted a little.
+    assert pooled[:, 16].max() < 1e-3 * true
+    assert pooled[:, 18:].max() < 1e-5 * true
+    # But a single pixel that has not been hit is not black for that.
+    unlit = (statistics.mean[0].reshape(size) == 0.0)[:, :16]
+    assert unlit.any()
+    assert pooled[:, :16][unlit].min() > 1e-3 * true

@@ -1,6 +1,7 @@
 """The visual difference metric: the stages of Fig. 2, in order. Only this file knows the order."""
 
 import math
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, Self
 
 import torch
@@ -16,6 +17,7 @@ from torch_vdm.contrast import (
     weber_contrast,
 )
 from torch_vdm.cortex import DEEPEST, Cortex, Haar, Transform, bands
+from torch_vdm.cortex.transform import mean_of
 from torch_vdm.csf import bandpass, barten, butterworth
 from torch_vdm.display import BT709_TO_XYZ, Display
 from torch_vdm.distance import (
@@ -27,15 +29,25 @@ from torch_vdm.distance import (
 from torch_vdm.effects import Effects
 from torch_vdm.fast import SMALLEST, compiled
 from torch_vdm.masking import energy_transducer, signed_transducer
-from torch_vdm.matrix import mix
+from torch_vdm.matrix import mix, product
 from torch_vdm.observer import Observer
-from torch_vdm.pair import Nonfinite, PairMetric
+from torch_vdm.pair import Nonfinite
 from torch_vdm.pooling import glance, phase_energy, pool, pool_halves, surround, surround_halves
 from torch_vdm.quadtree import push
 from torch_vdm.sarnoff import Sarnoff
+from torch_vdm.tiled import TiledMetric, cut
+from torch_vdm.tiling import Tiling
 
 # Planes with more numbers are computed in parts. Status: choice, measured.
-LARGEST_AT_ONCE = 2**20
+LARGEST_AT_ONCE = 2**18
+
+# Pixels of a strip of a large image, and how many levels, from the finest, are computed in strips.
+# Status: choice, measured.
+STRIP, STRIP_LEVELS = 2**19, 2
+
+# Levels of at most as many nodes are computed at once: there an operation costs more than the
+# numbers that it works on. Status: choice, measured.
+FEW_NODES = 64 * 64
 
 # Where the weights of a filter's bands are worked out, log2 cd/m2, and between them interpolated:
 # sensitivities change by less than 3 dB from one to the next. Status: choice.
@@ -49,21 +61,46 @@ FILTER = ("gain", "cutoff", "order")
 class Level(NamedTuple):
     """What a level of the transform responds to, as far as it does not depend on the image.
 
-    Where there are as many as orientations, one stands for all where all have the same.
+    For planes (h, w) of one level the last two sides are 1 and 1; for the nodes of several levels
+    in a row, they are 1 and as many. Where there are as many as orientations, one stands for all
+    where all have the same.
     """
 
     passed: Tensor
-    """(3,): the share of each cone's details that chromatic aberration leaves."""
+    """(3, 1, 1): the share of each cone's details that chromatic aberration leaves."""
     frequency: Tensor
-    """As many, in cycles/degree: the frequency of the best response."""
+    """(as many, 1, 1), in cycles/degree: the frequency of the best response."""
     gain: Tensor
-    """As many: what contrast is divided by."""
+    """(as many, 1, 1): what contrast is divided by."""
     sensitivity: Tensor
-    """(channels, as many): the contrast sensitivity, over the gain. Where the luminance is local,
-    that of C1 and C2 in bright light."""
+    """(channels, as many, 1, 1): the contrast sensitivity, over the gain. Where the luminance is
+    local, that of C1 and C2 in bright light."""
 
 
-class VDM(PairMetric):
+class Sight(NamedTuple):
+    """What turns the details of an image at a level into contrasts and weights them."""
+
+    scale: Tensor | None
+    """(B, 3, h, w): for each cone the share that chromatic aberration leaves, over what the
+    parent is adapted to. None where the details are weighted contrast already."""
+    sensitivity: Tensor
+    """(B, channels, orientations, h, w): the contrast sensitivity of each channel, or one
+    orientation or node of it where all have the same."""
+
+    def pushed(self, size: tuple[int, int]) -> "Sight":
+        """Return what is given at the parents at their children, on a plane of ``size``."""
+        shared = self.sensitivity.shape[-2:] == (1, 1)
+        sensitivity = self.sensitivity if shared else push(self.sensitivity, size)
+        return Sight(None if self.scale is None else push(self.scale, size), sensitivity)
+
+    def of(self, orientations: slice) -> "Sight":
+        """Return the sight of some orientations."""
+        if self.sensitivity.shape[2] == 1:
+            return self
+        return Sight(self.scale, self.sensitivity[:, :, orientations])
+
+
+class VDM(TiledMetric):
     """The visual difference metric of Bolin and Meyer 1999 as a module.
 
     Calling it with a test and a reference image, both (B, 3, H, W), gives the map of their
@@ -159,7 +196,50 @@ class VDM(PairMetric):
         )
 
     def _accumulated(self, test: Tensor, reference: Tensor) -> Tensor:
+        # Gradients need all that strips drop.
+        graph = torch.is_grad_enabled() and (test.requires_grad or reference.requires_grad)
+        if not (graph or torch.compiler.is_compiling()) and (
+            self.transform == Haar() and math.prod(_size(test)) >= 2 * STRIP
+        ):
+            return self._accumulated_in_strips(test, reference, self.transform)
         return self.compare(self.represent(test), self.represent(reference))
+
+    def _accumulated_in_strips(self, test: Tensor, reference: Tensor, haar: Haar) -> Tensor:
+        """Return the same of large images, the finest levels strip by strip.
+
+        A strip stays in the processor's cache, and its memory is used again for the next one, where
+        whole planes would be asked from the system anew in every call.
+        """
+        size, octaves = _size(test), STRIP_LEVELS
+        options = self._fast, self.observer.true_means
+        constants = self._constants(test.dtype)
+        # For each level, coarser first, what its nodes have in each strip.
+        fine: list[list[Tensor]] = [[] for _ in range(octaves)]
+        # For each image, the means of nodes of 2^octaves pixels, and those of rows.
+        means: tuple[list[Tensor], list[Tensor]] = [], []
+        means_of_rows: tuple[list[Tensor], list[Tensor]] = [], []
+        for strip in Tiling.strips(size, STRIP, octaves, haar.reach + 1):
+            strips: list[Cortex] = []
+            for number, image in enumerate((test, reference)):
+                cones = self._cone_planes(cut(image, strip.around))
+                # One level more, for the parents of the last.
+                cortex = haar.begin(cones, octaves + 1, *options)
+                means[number].append(cut(cortex.lowpass[1], strip.within(2**octaves)))
+                means_of_rows[number].append(cut(cones, strip.within(1)).mean(-1, keepdim=True))
+                strips.append(cortex)
+            for number, level in enumerate(self._levels(strips[0], constants)):
+                if number > 0:
+                    local = self._local_difference(strips[0], strips[1], number, level, constants)
+                    node = 2 ** (octaves + 1 - number)
+                    fine[number - 1].append(cut(local, strip.within(node)))
+        first, second = (
+            haar.coarser(
+                torch.cat(parts, -2), octaves, size, mean_of(torch.cat(rows, -2)), *options
+            )
+            for parts, rows in zip(means, means_of_rows, strict=True)
+        )
+        coarse, root = self._differences(first, second)
+        return accumulate([*coarse, *(torch.cat(planes, -2) for planes in fine)], root)
 
     def _to_pixels(self, plane: Tensor, size: tuple[int, int]) -> Tensor:
         # The leaves of overlapping nodes are the pixels.
@@ -173,22 +253,35 @@ class VDM(PairMetric):
         cycles, where the map stays local.
         """
         test, reference, _ = self._checked(test, reference)
-        constants = self._constants(test.dtype, "score_exponent", "score_coefficients")
-        exponent, coefficients = constants["score_exponent"], constants["score_coefficients"]
-        totals = []
-        for one, other in self._parts(test, reference):
-            first, second = self.represent(one), self.represent(other)
-            root = coefficients * self.lowpass_difference(first, second) ** exponent
-            glances = [
-                glance(
-                    self._scored(seen - expected, exponent),
-                    self.observer.score_window,
-                    self.transform.shifts,
-                )
-                for seen, expected in zip(self.respond(first), self.respond(second), strict=True)
-            ]
-            totals.append(accumulate(glances, root.sum(1, keepdim=True)).amax((1, 2, 3)))
-        return just_noticeable(torch.cat(totals) / coefficients, exponent)
+        totals = [
+            accumulate(*self._glances(self.represent(one), self.represent(other))).amax((1, 2, 3))
+            for one, other in self._parts(test, reference)
+        ]
+        return self._detected(torch.cat(totals))
+
+    def _detected(self, most: Tensor) -> Tensor:
+        """Return the score of what the largest leaf of each item has accumulated, (B,)."""
+        constants = self._constants(most.dtype, "score_exponent", "score_coefficients")
+        return just_noticeable(most / constants["score_coefficients"], constants["score_exponent"])
+
+    def _glances(self, first: Cortex, second: Cortex) -> tuple[list[Tensor], Tensor]:
+        """Return what one glance at each node adds to the score, and what every path begins with.
+
+        One (B, 1, h, w) a level, level 0 first, and (B, 1, 1, 1).
+        """
+        dtype = first.lowpass[0].dtype
+        constants = self._constants(dtype, "score_exponent", "score_coefficients")
+        exponent = constants["score_exponent"]
+        root = self.lowpass_difference(first, second) ** exponent
+        glances = [
+            glance(
+                self._scored(seen - expected, exponent),
+                self.observer.score_window,
+                self.transform.shifts,
+            )
+            for seen, expected in zip(self.respond(first), self.respond(second), strict=True)
+        ]
+        return glances, constants["score_coefficients"] * root.sum(1, keepdim=True)
 
     def _scored(self, difference: Tensor, exponent: Tensor) -> Tensor:
         """Return what each node of a level adds to the sum of the score, (B, 1, h, w)."""
@@ -209,19 +302,22 @@ class VDM(PairMetric):
 
         ``image`` is (B, 3, H, W) in float32 or float64, as the display expects it.
         """
+        planes = self._cone_planes(image)
+        options = self._fast, self.observer.true_means
+        if self.transform.csf == "levels":
+            return self.transform.decompose(planes, *options)
+        seen = self.transform.decompose(self._weighted_contrast(planes), *options)
+        return seen._replace(mean=mean_of(planes))
+
+    def _cone_planes(self, image: Tensor) -> Tensor:
+        """Return the cone responses (B, 3, H, W) to an image: display, cones."""
         constants = self._constants(image.dtype, "primaries", "cones")
         around = self.display, constants["primaries"], constants["cones"]
         if self._fast:
             planes: Tensor = compiled(_light)(image, *around)
-        else:
-            rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
-            planes = torch.cat([_light(part, *around) for part in image.split(rows, -2)], -2)
-        true_means = self.observer.true_means
-        if self.transform.csf == "levels":
-            return self.transform.decompose(planes, self._fast, true_means)
-        mean = planes.mean((-2, -1), keepdim=True)
-        seen = self._weighted_contrast(planes)
-        return self.transform.decompose(seen, self._fast, true_means)._replace(mean=mean)
+            return planes
+        rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
+        return torch.cat([self._kept(_light, part, *around) for part in image.split(rows, -2)], -2)
 
     def _weighted_contrast(self, planes: Tensor) -> Tensor:
         """Return the weighted contrast of A, C1, C2, 1 at threshold, of cone planes (B, 3, H, W).
@@ -279,7 +375,8 @@ class VDM(PairMetric):
         # Of the light alone: the eye's own is added to it again.
         luminances = torch.exp2(ones.new_tensor(LUMINANCES)) - constants["dark_light"]
         grey = luminances * constants["cones"].sum(1, keepdim=True)
-        level = Level(ones, frequency, ones, bright)
+        at_bands = (part[..., None, None] for part in (ones, frequency, ones, bright))
+        level = Level(*at_bands)
         chromatic = self.effects.chromatic
         sensitivity = _sensitivity(grey[None, :, None], level, constants, chromatic)[0, :, :, 0]
         achromatic = (constants["band_weights"][..., None] * sensitivity[0]).sum(1)
@@ -294,20 +391,14 @@ class VDM(PairMetric):
         One (B, channels, orientations, h, w) a level, level 0 first; 1 is threshold.
         """
         constants = self._constants(cortex.lowpass[0].dtype)
-        return tuple(
-            _response(
-                detail,
-                *self._sight(cortex, number, level, constants),
-                constants["opponents"],
-                constants["transducer_exponent"],
-                self.observer.signed,
-                self.effects.masking,
-                self.transform.phases,
+        responses = []
+        for number, level in enumerate(self._levels(cortex, constants)):
+            detail = cortex.details[number]
+            (sight,) = self._sights(level, constants, [cortex.parent_lowpass(number)])
+            responses.append(
+                _response(detail, sight.pushed(_size(detail)), *self._options(constants))
             )
-            for number, (detail, level) in enumerate(
-                zip(cortex.details, self._levels(cortex, constants), strict=True)
-            )
-        )
+        return tuple(responses)
 
     def lowpass_difference(self, first: Cortex, second: Cortex) -> Tensor:
         """Return the weighted contrast between the means of two images, the lowpass term.
@@ -329,10 +420,13 @@ class VDM(PairMetric):
         (B, 1, h, w) of the finest level. The responses of a level are taken and dropped one
         level at a time, which bounds memory.
         """
+        return accumulate(*self._differences(first, second))
+
+    def _differences(self, first: Cortex, second: Cortex) -> tuple[tuple[Tensor, ...], Tensor]:
+        """Return what each node adds to the map, and what every path begins with."""
         constants = self._constants(first.lowpass[0].dtype, "summation_exponent")
         root = self.lowpass_difference(first, second) ** constants["summation_exponent"]
-        local = self.local_differences(first, second)
-        return accumulate(local, root.sum(1, keepdim=True))
+        return self.local_differences(first, second), root.sum(1, keepdim=True)
 
     def local_differences(self, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
         """Return the local visual difference of every node (Eq. 5), before the root.
@@ -340,10 +434,38 @@ class VDM(PairMetric):
         One (B, 1, h, w) a level, level 0 first.
         """
         constants = self._constants(first.lowpass[0].dtype)
-        return tuple(
-            self._local_difference(first, second, number, level, constants)
-            for number, level in enumerate(self._levels(first, constants))
+        levels = self._levels(first, constants)
+        few = sum(math.prod(_size(detail)) <= FEW_NODES for detail in first.details)
+        return (
+            *self._local_differences_of_few(first, second, levels[:few], constants),
+            *(
+                self._local_difference(first, second, number, levels[number], constants)
+                for number in range(few, len(levels))
+            ),
         )
+
+    def _local_differences_of_few(
+        self, first: Cortex, second: Cortex, levels: list[Level], constants: dict[str, Tensor]
+    ) -> list[Tensor]:
+        """Return the local visual differences of the coarsest levels, their nodes in a row."""
+        if not levels:
+            return []
+        sizes = [_size(detail) for detail in first.details[: len(levels)]]
+        nodes = [math.prod(size) for size in sizes]
+        details, parents = [], []
+        for cortex in (first, second):
+            details.append(_in_a_row(cortex.details[: len(levels)]))
+            lowpass = (cortex.parent_lowpass(number) for number in range(len(levels)))
+            pushed = [push(plane, size) for plane, size in zip(lowpass, sizes, strict=True)]
+            parents.append(_in_a_row(pushed))
+        sights = self._sights(_levels_in_a_row(levels, nodes), constants, parents)
+        difference = _response_difference(
+            details[0], details[1], sights[0], sights[1], *self._options(constants)
+        )
+        return [
+            self._gathered(part.unflatten(-1, size).squeeze(-3), constants["summation_exponent"])
+            for part, size in zip(difference.split(nodes, -1), sizes, strict=True)
+        ]
 
     def _local_difference(
         self,
@@ -354,36 +476,48 @@ class VDM(PairMetric):
         constants: dict[str, Tensor],
     ) -> Tensor:
         """Return the local visual difference (B, 1, h, w) of one level."""
-        one, other = first.details[number], second.details[number]
-        scale, sensitivity = self._sight(first, number, level, constants)
-        other_scale, other_sensitivity = self._sight(second, number, level, constants)
-        phases = self.transform.phases
-        fast = self._fast and one.numel() >= SMALLEST
+        details, others = first.details[number], second.details[number]
+        parents = [cortex.parent_lowpass(number) for cortex in (first, second)]
+        fast = self._fast and details.numel() >= SMALLEST
+        sight, other_sight = (
+            sight.pushed(_size(details)) for sight in self._sights(level, constants, parents, fast)
+        )
+        orientations = details.shape[2]
         respond = compiled(_response_difference) if fast else _response_difference
         # One orientation at a time where the planes are large: what is computed on the way then
         # stays in the processor's cache. Compiled code keeps nothing on the way.
-        at_once = one.shape[2] if fast or one.numel() <= LARGEST_AT_ONCE else phases
+        at_once = orientations
+        if not fast and details.numel() > LARGEST_AT_ONCE:
+            at_once = self.transform.phases
         local = []
-        for plane in range(0, one.shape[2], at_once):
+        for plane in range(0, orientations, at_once):
             some = slice(plane, plane + at_once)
-            same = some if sensitivity.shape[2] > 1 else slice(None)
-            difference = respond(
-                one[:, :, some],
-                other[:, :, some],
-                scale,
-                sensitivity[:, :, same],
-                other_scale,
-                other_sensitivity[:, :, same],
-                constants["opponents"],
-                constants["transducer_exponent"],
-                self.observer.signed,
-                self.effects.masking,
-                phases,
+            arguments = (
+                details[:, :, some],
+                others[:, :, some],
+                sight.of(some),
+                other_sight.of(some),
+                *self._options(constants),
             )
-            local.append(self._gathered(difference, constants["summation_exponent"], fast))
+
+            def gathered(*arguments: Any) -> Tensor:
+                difference = respond(*arguments)
+                return self._gathered(difference, constants["summation_exponent"], fast)
+
+            local.append(self._kept(gathered, *arguments))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]
 
-    def _gathered(self, difference: Tensor, exponent: Tensor, fast: bool) -> Tensor:
+    def _options(self, constants: dict[str, Tensor]) -> tuple[Tensor, Tensor, bool, bool, int]:
+        """Return what `_response` takes beside details and sight."""
+        return (
+            constants["opponents"],
+            constants["transducer_exponent"],
+            self.observer.signed,
+            self.effects.masking,
+            self.transform.phases,
+        )
+
+    def _gathered(self, difference: Tensor, exponent: Tensor, fast: bool = False) -> Tensor:
         """Return the local visual difference of response differences, after spatial pooling."""
         if self.transform.shifts == 1:
             if not self.effects.pooling:
@@ -399,27 +533,19 @@ class VDM(PairMetric):
         local = columns(rows(surrounded, nodes, -1), nodes, exponent)
         return local  # noqa: RET504  # for its type
 
-    def _sight(
-        self, cortex: Cortex, number: int, level: Level, constants: dict[str, Tensor]
-    ) -> tuple[Tensor | None, Tensor]:
-        """Return what turns a level's details into contrasts and weights them.
-
-        For each cone (B, 3, h, w): the share that chromatic aberration leaves, over the parent's
-        adaptation; scaled at the parents, of which there are fewer. For each channel the contrast
-        sensitivity, (B, channels, orientations, h, w), or one orientation or node of it where all
-        have the same. Of details that are weighted contrast already: None, and one over the gains.
-        """
+    def _sights(
+        self,
+        level: Level,
+        constants: dict[str, Tensor],
+        parents: Sequence[Tensor],
+        fast: bool = False,
+    ) -> list[Sight]:
+        """Return the sight of a level for each image, at the parents, whose lowpass is given."""
         if self.transform.csf == "filter":
-            return None, (1.0 / level.gain)[None, None, :, None, None]
-        parent = cortex.parent_lowpass(number)
-        size = (cortex.details[number].shape[-2], cortex.details[number].shape[-1])
-        fast = self._fast and parent.numel() >= SMALLEST
-        scaled = compiled(_scale) if fast else _scale
-        scale = push(scaled(parent, level.passed, constants["dark_cones"]), size)
-        if self.observer.adaptation_luminance is not None:
-            return scale, level.sensitivity[None, ..., None, None]
-        sensed = compiled(_sensitivity) if fast else _sensitivity
-        return scale, push(sensed(parent, level, constants, self.effects.chromatic), size)
+            return [Sight(None, (1.0 / level.gain)[None, None])] * len(parents)
+        look = compiled(_sight) if fast else _sight
+        local = self.observer.adaptation_luminance is None
+        return [look(parent, level, constants, local, self.effects.chromatic) for parent in parents]
 
     def _levels(self, cortex: Cortex, constants: dict[str, Tensor]) -> list[Level]:
         """Return what each level of ``cortex`` responds to, level 0 (the coarsest) first.
@@ -429,11 +555,15 @@ class VDM(PairMetric):
         count = len(cortex.details)
         if count == 0:
             return []
-        frequency, gain = (constants[name][:count].flip(0) for name in ("frequencies", "gains"))
+        some = slice(cortex.finest, cortex.finest + count)
+        frequency, gain = (constants[name][some].flip(0) for name in ("frequencies", "gains"))
         passed = self._passed(frequency[:, 0], constants)
         bright = self._bright(frequency, gain, constants)
         # Copies, for compiled code is specialised on the offset of a view.
-        columns = [[row.clone() for row in part] for part in (passed, frequency, gain, bright)]
+        columns = (
+            [row[..., None, None].clone() for row in part]
+            for part in (passed, frequency, gain, bright)
+        )
         return [Level(*row) for row in zip(*columns, strict=True)]
 
     def _passed(self, frequency: Tensor, constants: dict[str, Tensor]) -> Tensor:
@@ -461,15 +591,37 @@ class VDM(PairMetric):
         return torch.stack(channels, 1) / gain.unsqueeze(1) if channels else gain.unsqueeze(1)
 
 
+def _size(plane: Tensor) -> tuple[int, int]:
+    return plane.shape[-2], plane.shape[-1]
+
+
+def _in_a_row(planes: Iterable[Tensor]) -> Tensor:
+    """Return the nodes of planes (..., h, w) in a row, (..., 1, all of them)."""
+    return torch.cat([plane.flatten(-2) for plane in planes], -1).unsqueeze(-2)
+
+
+def _levels_in_a_row(levels: Sequence[Level], nodes: Sequence[int]) -> Level:
+    """Return several levels as one, whose planes are the ``nodes`` of each in a row."""
+    device = levels[0].passed.device
+    count = torch.tensor(nodes, device=device)
+    # For each node its level; the size is given so that nothing is read back from the device.
+    which = torch.repeat_interleave(
+        torch.arange(len(nodes), device=device), count, output_size=sum(nodes)
+    )
+    return Level(*(torch.cat(part, -1)[..., which] for part in zip(*levels, strict=True)))
+
+
 def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) -> Tensor:
     """Return the cone responses (B, 3, H, W) to an image on a display."""
-    return cone_responses(display.to_xyz(image, primaries), cones)
+    if display.encoding == "xyz":
+        return cone_responses(display.to_xyz(image, primaries), cones)
+    # From the display's primaries to cones at once: one mixing of all pixels instead of two.
+    return display.to_xyz(image, product(cones, primaries))
 
 
 def _response(
     details: Tensor,
-    scale: Tensor | None,
-    sensitivity: Tensor,
+    sight: Sight,
     matrix: Tensor,
     exponent: Tensor,
     signed: bool,
@@ -477,8 +629,10 @@ def _response(
     phases: int,
 ) -> Tensor:
     """Return the responses of one level of one image: local contrast to the transducer."""
-    contrast = details if scale is None else opponents(local_contrast(details, scale), matrix)
-    weighted = contrast * sensitivity
+    contrast = details
+    if sight.scale is not None:
+        contrast = opponents(local_contrast(details, sight.scale), matrix)
+    weighted = contrast * sight.sensitivity
     if signed:
         return signed_transducer(weighted, exponent, phases) if masking else weighted
     return energy_transducer(weighted * weighted) if masking else weighted.abs()
@@ -487,10 +641,8 @@ def _response(
 def _response_difference(
     details: Tensor,
     other_details: Tensor,
-    scale: Tensor | None,
-    sensitivity: Tensor,
-    other_scale: Tensor | None,
-    other_sensitivity: Tensor,
+    sight: Sight,
+    other_sight: Sight,
     matrix: Tensor,
     exponent: Tensor,
     signed: bool,
@@ -502,16 +654,24 @@ def _response_difference(
     Each image by itself: equal images then take equal paths through the vectorised loops, and
     their difference is exactly 0.
     """
-    response = _response(details, scale, sensitivity, matrix, exponent, signed, masking, phases)
-    other = _response(
-        other_details, other_scale, other_sensitivity, matrix, exponent, signed, masking, phases
+    options = matrix, exponent, signed, masking, phases
+    difference = _response(details, sight, *options) - _response(
+        other_details, other_sight, *options
     )
-    return (response - other).abs() if signed else response - other
+    return difference.abs() if signed else difference
 
 
-def _scale(parent: Tensor, passed: Tensor, dark_cones: Tensor) -> Tensor:
-    """Return what turns details into contrasts, at their parents."""
-    return passed.view(3, 1, 1) / adapted(parent, dark_cones)
+def _sight(
+    parent: Tensor, level: Level, constants: dict[str, Tensor], local: bool, chromatic: bool
+) -> Sight:
+    """Return the sight of a level at its parents, of which there are fewer than nodes.
+
+    ``parent`` is their lowpass (B, 3, h, w); ``local``: in the local luminance.
+    """
+    scale = level.passed / adapted(parent, constants["dark_cones"])
+    if not local:
+        return Sight(scale, level.sensitivity.unsqueeze(0))
+    return Sight(scale, _sensitivity(parent, level, constants, chromatic))
 
 
 def _sensitivity(
@@ -523,16 +683,16 @@ def _sensitivity(
     dark = torch.log2(1.0 + constants["dim_luminance"] / luminance)
     glare = torch.log2(1.0 + luminance / constants["glare_luminance"])
     faint = torch.log2(1.0 + constants["peak_luminance"] / luminance)
-    relative = torch.log2(level.frequency / constants["peak_frequency"]).view(-1, 1, 1)
+    relative = torch.log2(level.frequency / constants["peak_frequency"])
     octaves = relative + constants["peak_exponent"] * faint
     dimmed = constants["achromatic_dimming"] * dark + constants["glare_exponent"] * glare
     shape = bandpass(octaves, constants["band_width"], constants["band_floor"])
-    gain = constants["achromatic_gain"] / level.gain.view(-1, 1, 1)
+    gain = constants["achromatic_gain"] / level.gain
     achromatic = gain * shape * torch.exp2(-dimmed)
     if not chromatic:
         return achromatic
     dim = torch.exp2(-constants["chromatic_dimming"] * dark)
-    return torch.cat((achromatic, level.sensitivity[..., None, None] * dim), 1)
+    return torch.cat((achromatic, level.sensitivity * dim), 1)
 
 
 def _band_sensitivity(lowpass: Tensor, table: Tensor, constants: dict[str, Tensor]) -> Tensor:

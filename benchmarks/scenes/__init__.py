@@ -1,0 +1,1 @@
+"""The scenes of the paper's Fig. 14, for Mitsuba."""

@@ -1,0 +1,101 @@
+"""A material of our own for Mitsuba: Lambert's, sampled uniformly over the hemisphere.
+
+Blind Monte Carlo as the paper describes it (Section 4.1) sends rays "at random directions". A ray
+that finds the light brings 2 rho L cos(theta) home, any other 0; how many find it depends on the
+light's solid angle alone, so that noise over light is the same wherever the whole light is seen.
+Mitsuba's own ``diffuse`` samples by the cosine, and its noise over light grows in the dark.
+
+It is handed Mitsuba's module: `sampling.renderers.mitsuba` alone imports it.
+"""
+
+from typing import Any
+
+# Its name in a scene: <bsdf type="hemisphere">, with a texture or a colour ``reflectance``.
+NAME = "hemisphere"
+
+# Where the scene gives none, as Mitsuba's ``diffuse`` has it. Status: choice.
+REFLECTANCE = 0.5
+
+
+def register(mi: Any, dr: Any) -> None:
+    """Make the material known to the variant of Mitsuba that is set."""
+    base: Any = mi.BSDF
+    warp: Any = mi.warp
+    cosine: Any = mi.Frame3f.cos_theta
+
+    class Hemisphere(base):  # type: ignore[misc]  # its base is known when Mitsuba is
+        """Lambert's reflection from one side, sampled without its cosine."""
+
+        def __init__(self, properties: Any) -> None:
+            super().__init__(properties)
+            self.reflectance = properties.get_texture("reflectance", REFLECTANCE)
+            self.m_components = [mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide]
+            self.m_flags = self.m_components[0]
+
+        # The arguments that it has no use for are in Mitsuba's signatures.
+        def sample(
+            self,
+            context: Any,
+            surface: Any,
+            sample1: Any,  # noqa: ARG002
+            sample2: Any,
+            active: Any = True,
+        ) -> tuple[Any, Any]:
+            """Return a direction, and the reflected share over its density."""
+            found = mi.BSDFSample3f()
+            found.wo = warp.square_to_uniform_hemisphere(sample2)
+            found.pdf = warp.square_to_uniform_hemisphere_pdf(found.wo)
+            found.eta = 1.0
+            found.sampled_type = +mi.BSDFFlags.DiffuseReflection
+            found.sampled_component = 0
+            value = self.eval(context, surface, found.wo, active) * dr.rcp(found.pdf)
+            return found, value
+
+        def eval(
+            self,
+            context: Any,  # noqa: ARG002
+            surface: Any,
+            outwards: Any,
+            active: Any = True,
+        ) -> Any:
+            """Return rho cos(theta) / pi, 0 for what is below the surface."""
+            above = self._above(surface, outwards, active)
+            light = self.reflectance.eval(surface, above) * (dr.inv_pi * cosine(outwards))
+            return light & above
+
+        def pdf(
+            self,
+            context: Any,  # noqa: ARG002
+            surface: Any,
+            outwards: Any,
+            active: Any = True,
+        ) -> Any:
+            """Return the density of a direction, 1 / (2 pi)."""
+            above = self._above(surface, outwards, active)
+            return dr.select(above, warp.square_to_uniform_hemisphere_pdf(outwards), 0.0)
+
+        def eval_pdf(
+            self, context: Any, surface: Any, outwards: Any, active: Any = True
+        ) -> tuple[Any, Any]:
+            """Return both."""
+            return (
+                self.eval(context, surface, outwards, active),
+                self.pdf(context, surface, outwards, active),
+            )
+
+        def eval_diffuse_reflectance(self, surface: Any, active: Any = True) -> Any:
+            """Return the albedo."""
+            return self.reflectance.eval(surface, active)
+
+        def traverse(self, callback: Any) -> None:
+            """Show what it is made of."""
+            callback.put("reflectance", self.reflectance, mi.ParamFlags.Differentiable)
+
+        def to_string(self) -> str:
+            """Return its name and its reflectance."""
+            return f"Hemisphere[reflectance={self.reflectance}]"
+
+        def _above(self, surface: Any, outwards: Any, active: Any) -> Any:
+            return active & (cosine(surface.wi) > 0.0) & (cosine(outwards) > 0.0)
+
+    mi.register_bsdf(NAME, Hemisphere)
