@@ -463,7 +463,7 @@ def times(quick: bool) -> dict[str, Any]:
         "peak_extra_megabytes": {
             n: [_memory(n, size, b) for b in ((False, True) if n in losses else (False,))]
             for n in chosen
-            if not quick and "compiled" not in n
+            if not quick and "compiled" not in n and not n.startswith("fast,")
         },
         "sarnoff_ratios": {},
     }

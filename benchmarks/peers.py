@@ -45,17 +45,11 @@ class Peer:
         degree: (N, k), k figures that grow with the difference.
     timed
         What is timed: of two sRGB-coded images (1, 3, H, W).
-    has_map
-        Whether it tells where.
-    differentiable
-        Whether it can be a loss.
     """
 
     name: str
     values: Values
     timed: Callable[[Tensor, Tensor], Any]
-    has_map: bool = False
-    differentiable: bool = True
 
 
 def coded(light: Tensor, background: float) -> Tensor:
@@ -92,7 +86,7 @@ def _ssim() -> Peer:
     def values(tests: Tensor, reference: Tensor, _: float) -> Tensor:
         return _of_map(1.0 - ssim(*_coded_pair(tests, reference), 11))
 
-    return Peer("SSIM", values, lambda test, reference: ssim(test, reference, 11), True)
+    return Peer("SSIM", values, lambda test, reference: ssim(test, reference, 11))
 
 
 def _ms_ssim() -> Peer:
@@ -130,7 +124,7 @@ def _flip() -> Peer:
     def timed(test: Tensor, reference: Tensor) -> Tensor:
         return error(test[0], reference[0], 60.0)
 
-    return Peer("FLIP", values, timed, has_map=True, differentiable=False)
+    return Peer("FLIP", values, timed)
 
 
 def _cvvdp() -> Peer:
@@ -157,13 +151,14 @@ def _cvvdp() -> Peer:
         judged = [float(metric.predict(light(t), base, dim_order="HWC")[0]) for t in tests]
         return 10.0 - torch.tensor(judged, dtype=torch.float64).view(-1, 1)
 
-    def timed(test: Tensor, reference: Tensor) -> Any:
-        metric = pycvvdp.cvvdp(
-            display_name="standard_4k", heatmap="raw", quiet=True, device=torch.device("cpu")
-        )
-        return metric.predict(test, reference, dim_order="BCHW")[0]
+    whole = pycvvdp.cvvdp(
+        display_name="standard_4k", heatmap="raw", quiet=True, device=torch.device("cpu")
+    )
 
-    return Peer("ColorVideoVDP", values, timed, has_map=True)
+    def timed(test: Tensor, reference: Tensor) -> Any:
+        return whole.predict(test, reference, dim_order="BCHW")[0]
+
+    return Peer("ColorVideoVDP", values, timed)
 
 
 PEERS = {"SSIM": _ssim, "MS-SSIM": _ms_ssim, "FLIP": _flip, "ColorVideoVDP": _cvvdp}

@@ -192,7 +192,7 @@ class Sampler:
         if metric.display.encoding == "srgb":
             raise ValueError("expected a metric with a linear display, got sRGB-coded values")
         if metric.transform != Haar():
-            raise ValueError(f"expected a metric on the Haar transform, got {metric.transform}")
+            raise ValueError(f"expected a metric on Haar(), got {metric.transform}")
         self.size = (int(size[0]), int(size[1]))
         self.metric = metric
         self.settings = settings or Settings()

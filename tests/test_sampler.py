@@ -14,7 +14,8 @@ from sampling.renderers.synthetic import Synthetic
 from sampling.sampler import UNLIT
 from sampling.statistics import PIECE
 from sampling.strategies import STRATEGIES
-from torch_vdm import VDM, Display, Observer
+from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar
+from torch_vdm.cortex import Transform
 
 METRIC = VDM(60.0, Display.linear(100.0))
 SIZE = (12, 9)
@@ -297,3 +298,10 @@ def test_the_stop_is_honest(observer: Observer) -> None:
             ratios.append(true_maximum(sampler.image, renderer.mean, metric) / 3.0)
     assert sum(ratio <= 1.0 for ratio in ratios) >= 20
     assert 0.6 <= np.median(ratios) <= 0.95
+
+
+@pytest.mark.parametrize("transform", [Haar("filter"), StationaryHaar()], ids=repr)
+def test_takes_the_papers_transform_only(transform: Transform) -> None:
+    metric = VDM(60.0, Display.linear(100.0), transform=transform)
+    with pytest.raises(ValueError, match=r"expected a metric on Haar\(\), got"):
+        Sampler(SIZE, metric)

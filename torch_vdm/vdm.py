@@ -711,7 +711,7 @@ def _band_sensitivity(lowpass: Tensor, table: Tensor, constants: dict[str, Tenso
     place = (torch.log2(seen[:, 0]) - LUMINANCES[0]).clamp(0.0, last)
     low = place.detach().floor().clamp_max(last - 1.0)
     index, rest = low.long(), place - low
-    return torch.stack([torch.lerp(row[:-1][index], row[1:][index], rest) for row in table], 1)
+    return torch.lerp(table[:, index], table[:, index + 1], rest).transpose(0, 1)
 
 
 def _band_contrast(
