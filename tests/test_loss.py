@@ -154,7 +154,9 @@ def test_orders_images_as_the_map_does_near_threshold() -> None:
 def test_a_checkpoint_changes_no_gradient(
     transform: Transform, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("torch_vdm.vdm.LARGEST_AT_ONCE", 1000)  # in parts, as a large image is
+    # In parts and level by level, as a large image is.
+    monkeypatch.setattr("torch_vdm.vdm.LARGEST_AT_ONCE", 1000)
+    monkeypatch.setattr("torch_vdm.vdm.FEW_NODES", 16)
     generator = torch.Generator().manual_seed(5)
     test, reference = torch.rand(2, 2, 3, 37, 50, dtype=torch.float64, generator=generator)
     test.requires_grad_()
