@@ -117,19 +117,19 @@ def full_tables() -> list[Table]:
         Table("64x64, 2 JND", 64, 2.0, calibrated, 20, every),
         Table("Mitsuba, 64x64, 2 JND", 64, 2.0, calibrated, 20, found),
         Table("32x32, 1 JND", 32, 1.0, calibrated, 20, cheap),
-        Table("Mitsuba, 64x64, 1 JND", 64, 1.0, calibrated, 20, affordable),
-        Table("32x32, 2 JND", 32, 2.0, calibrated, 20, every),
-        Table("32x32, 2 JND, unbiased", 32, 2.0, calibrated, 10, every, unbiased=True),
-        Table("32x32, 2 JND, uniform", 32, 2.0, calibrated, 10, every, "uniform"),
+        Table("Mitsuba, 64x64, 1 JND", 64, 1.0, calibrated, 10, affordable),
+        Table("32x32, 2 JND", 32, 2.0, calibrated, 5, every),
+        Table("32x32, 2 JND, unbiased", 32, 2.0, calibrated, 5, every, unbiased=True),
+        Table("32x32, 2 JND, uniform", 32, 2.0, calibrated, 5, every, "uniform"),
         *(
             Table(
                 f"32x32, half-buffer's own stop at {threshold}, judged at 2 JND",
-                *(32, 2.0, calibrated, 5, every, "halfbuffer"),
+                *(32, 2.0, calibrated, 3, every, "halfbuffer"),
                 noise_threshold=threshold,
             )
             for threshold in NOISE_THRESHOLDS
         ),
-        Table("32x32, 2 JND, the paper's observer", 32, 2.0, paper, 10, every),
+        Table("32x32, 2 JND, the paper's observer", 32, 2.0, paper, 5, every),
     ]
 
 
