@@ -123,8 +123,8 @@ def test_it_is_a_covariance() -> None:
 
 
 def test_a_saturated_colour_does_not_scale_its_parents_variance_without_bound() -> None:
-    # Red or green by chance, and never both: whole blocks of pixels have seen one of them alone, and
-    # their other channel is 0 but for rounding.
+    # Red or green by chance, and never both: some pixels have seen one of them alone, and their
+    # other channel is 0 but for rounding.
     size, count = (32, 32), 16
     red, green = np.zeros((*size, 3)), np.zeros((*size, 3))
     red[..., 0], green[..., 1] = 1.0, 0.297
@@ -138,3 +138,25 @@ def test_a_saturated_colour_does_not_scale_its_parents_variance_without_bound() 
     # scale by which its mean may exceed the others'.
     assert (pooled.mean((1, 2)) <= 1.2 * true + 1e-12).all()
     assert (pooled.max((1, 2)) <= 4.0 * true + 1e-12).all()
+
+
+def test_a_black_background_beside_a_seldom_hit_light_is_known_to_be_black() -> None:
+    # A half that one sample in ten lights, and one that is black.
+    size, count = (32, 32), 64
+    lit = np.zeros((*size, 3))
+    lit[:, :16] = 1.0
+    renderer = Synthetic(np.zeros_like(lit), lit, np.full(size, 0.1), 5)
+    pixels = np.arange(size[0] * size[1])
+    statistics = Statistics(len(pixels))
+    statistics.add(renderer.sample(pixels, 0 * pixels, 0 * pixels + count))
+    pooled = pooled_covariance(statistics, size)[0]
+    true = renderer.covariance[0, 0, 0, 0]
+    assert pooled[:, :16].mean() == pytest.approx(true, rel=0.1)
+    # Blocks of black pixels have not been hit where as many beside them were, hundreds of times;
+    # those at the border are still doubted a little.
+    assert pooled[:, 16].max() < 1e-3 * true
+    assert pooled[:, 18:].max() < 1e-5 * true
+    # But a single pixel that has not been hit is not black for that.
+    unlit = (statistics.mean[0].reshape(size) == 0.0)[:, :16]
+    assert unlit.any()
+    assert pooled[:, :16][unlit].min() > 1e-3 * true

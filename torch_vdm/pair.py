@@ -1,10 +1,11 @@
 """What every metric of two images shares: its options, its checks, its precision."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from torch_vdm.display import Display
 from torch_vdm.distance import just_noticeable
@@ -43,6 +44,17 @@ class PairMetric(nn.Module):
         self.display = display or Display.srgb()
         self.nonfinite = nonfinite
         self._fast = False
+        self._checkpointed = False
+
+    def _kept(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a part of the forward pass, of which a checkpoint keeps the arguments alone.
+
+        What was computed on the way is then computed again in the backward pass. Compiled graphs
+        choose by themselves what they keep.
+        """
+        if not self._checkpointed or torch.compiler.is_compiling() or not torch.is_grad_enabled():
+            return function(*arguments)
+        return checkpoint(function, *arguments, use_reentrant=False, preserve_rng_state=False)
 
     def _accumulated(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the accumulated differences of two checked batches, (B, 1, h, w)."""
@@ -87,7 +99,8 @@ class PairMetric(nn.Module):
         Tensor
             (B, 1, H, W), JND.
         """
-        total, seen = self._total(test, reference)
+        test, reference, seen = self._checked(test, reference)
+        total = self._total(test, reference)
         constants = self._constants(total.dtype, "summation_exponent")
         jnd = just_noticeable(total, constants["summation_exponent"])
         return masked(self._to_pixels(jnd, (test.shape[-2], test.shape[-1])), seen)
@@ -98,7 +111,11 @@ class PairMetric(nn.Module):
         (B, 1, H, W), from (B, 3, H, W) twice. Smooth where the images are equal, so that a loss
         is taken from here; see `VDMLoss`.
         """
-        total, seen = self._total(test, reference)
+        return self._power(*self._checked(test, reference))
+
+    def _power(self, test: Tensor, reference: Tensor, seen: Tensor | None) -> Tensor:
+        """Return `power` of two checked batches."""
+        total = self._total(test, reference)
         return masked(self._to_pixels(total, (test.shape[-2], test.shape[-1])), seen)
 
     def _constants(self, dtype: torch.dtype, *names: str) -> dict[str, Tensor]:
@@ -106,10 +123,9 @@ class PairMetric(nn.Module):
         buffers = {name: getattr(self, name) for name in names} or dict(self.named_buffers())
         return {name: value.to(dtype) for name, value in buffers.items()}
 
-    def _total(self, test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor | None]:
-        test, reference, seen = self._checked(test, reference)
+    def _total(self, test: Tensor, reference: Tensor) -> Tensor:
         totals = [self._accumulated(one, other) for one, other in self._parts(test, reference)]
-        return torch.cat(totals), seen
+        return torch.cat(totals)
 
     def _parts(self, test: Tensor, reference: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """Yield both batches, whole or, on the fast route, item by item."""

@@ -191,10 +191,10 @@ class TiledMetric(PairMetric):
                 local, total = paths(self.represent(one), self.represent(other))
                 if coarse is not None:
                     fine = enumerate(reversed(local[-tiling.levels :]))
-                    local = [_cut(plane, tile.within(2 ** (k + 1) // shifts)) for k, plane in fine]
+                    local = [cut(plane, tile.within(2 ** (k + 1) // shifts)) for k, plane in fine]
                     local.reverse()
-                    total = _cut(coarse, tile.of_image(2 ** (tiling.levels + 1) // shifts))
-                    seen = None if seen is None else _cut(seen, tile.within(1))
+                    total = cut(coarse, tile.of_image(2 ** (tiling.levels + 1) // shifts))
+                    seen = None if seen is None else cut(seen, tile.within(1))
                 yield _Done(item, tile.part, accumulate(local, total), seen)
                 step()
 
@@ -215,8 +215,8 @@ class TiledMetric(PairMetric):
             for number, image in enumerate(pair):
                 cones = self._cone_planes(image)
                 reduced = self.transform.reduced(cones, octaves, *options)
-                planes[number].append(_cut(reduced, tile.within(2**octaves)))
-                inside = _cut(cones, tile.within(1)).double().sum((-2, -1), keepdim=True)
+                planes[number].append(cut(reduced, tile.within(2**octaves)))
+                inside = cut(cones, tile.within(1)).double().sum((-2, -1), keepdim=True)
                 sums[number] = sums[number].to(inside) + inside
             step()
         pixels = math.prod(tiling.size)
@@ -232,7 +232,7 @@ class TiledMetric(PairMetric):
         return coarse
 
 
-def _cut(plane: Tensor, part: Slices) -> Tensor:
+def cut(plane: Tensor, part: Slices) -> Tensor:
     """Return a part of a plane (B, C, h, w)."""
     return plane[..., part[0], part[1]].contiguous()
 

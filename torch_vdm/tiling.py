@@ -67,8 +67,8 @@ class Tiling:
     ----------
     size
         (H, W) of the image.
-    side
-        Pixels a side of a tile.
+    sides
+        Rows and columns of a tile.
     levels
         How many levels, from the finest, are computed in tiles; all others come from the whole
         image's lowpass pyramid.
@@ -77,7 +77,7 @@ class Tiling:
     """
 
     size: tuple[int, int]
-    side: int
+    sides: tuple[int, int]
     levels: int
     halo: int
 
@@ -98,29 +98,42 @@ class Tiling:
         levels = min(wanted, tile.bit_length() - 2)
         parent = 2 ** (levels + 1)
         halo = -(-nodes // (2 * shifts)) * parent
-        return cls(size, tile // parent * parent, levels, halo)
+        side = tile // parent * parent
+        return cls(size, (side, side), levels, halo)
+
+    @classmethod
+    def bands(cls, size: tuple[int, int], pixels: int, levels: int, nodes: int) -> "Tiling":
+        """Return a tiling by bands as wide as the image, of about as many pixels.
+
+        For nodes that lie side by side; ``levels`` and ``nodes`` as in `fit`.
+        """
+        parent = 2 ** (levels + 1)
+        halo = -(-nodes // 2) * parent
+        # No thinner than so many halos, which are computed twice.
+        rows = max(pixels // (size[1] * parent) * parent, 4 * halo)
+        return cls(size, (rows, size[1]), levels, halo)
 
     @property
     def whole(self) -> bool:
         """Whether the image is no larger than a tile."""
-        return max(self.size) <= self.side
+        return all(side <= most for side, most in zip(self.size, self.sides, strict=True))
 
     @property
     def across(self) -> int:
         """The number of tiles in a row."""
-        return -(-self.size[1] // self.side)
+        return -(-self.size[1] // self.sides[1])
 
     def __len__(self) -> int:
         """Return the number of tiles."""
-        return self.across * -(-self.size[0] // self.side)
+        return self.across * -(-self.size[0] // self.sides[0])
 
     def __iter__(self) -> Iterator[Tile]:
         """Yield the tiles, row by row."""
-        height, width = self.size
-        for top in range(0, height, self.side):
-            rows = slice(top, min(top + self.side, height))
-            for left in range(0, width, self.side):
-                columns = slice(left, min(left + self.side, width))
+        (height, width), (most_rows, most_columns) = self.size, self.sides
+        for top in range(0, height, most_rows):
+            rows = slice(top, min(top + most_rows, height))
+            for left in range(0, width, most_columns):
+                columns = slice(left, min(left + most_columns, width))
                 yield Tile(
                     (rows, columns), (self._wider(rows, height), self._wider(columns, width))
                 )

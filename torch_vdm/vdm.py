@@ -17,6 +17,7 @@ from torch_vdm.contrast import (
     weber_contrast,
 )
 from torch_vdm.cortex import DEEPEST, Cortex, Haar, Transform
+from torch_vdm.cortex.transform import mean_of
 from torch_vdm.csf import bandpass, barten, butterworth
 from torch_vdm.display import BT709_TO_XYZ, Display
 from torch_vdm.distance import (
@@ -34,10 +35,15 @@ from torch_vdm.pair import Nonfinite
 from torch_vdm.pooling import glance, phase_energy, pool, pool_halves, surround, surround_halves
 from torch_vdm.quadtree import push
 from torch_vdm.sarnoff import Sarnoff
-from torch_vdm.tiled import TiledMetric
+from torch_vdm.tiled import TiledMetric, cut
+from torch_vdm.tiling import Tiling
 
 # Planes with more numbers are computed in parts. Status: choice, measured.
 LARGEST_AT_ONCE = 2**18
+
+# Pixels of a band of a large image, and how many levels, from the finest, are computed in bands.
+# Status: choice, measured.
+BAND, BAND_LEVELS = 2**19, 2
 
 # Levels of at most as many nodes are computed at once: there an operation costs more than the
 # numbers that it works on. Status: choice, measured.
@@ -183,7 +189,50 @@ class VDM(TiledMetric):
         )
 
     def _accumulated(self, test: Tensor, reference: Tensor) -> Tensor:
+        # Gradients need all that bands drop.
+        graph = torch.is_grad_enabled() and (test.requires_grad or reference.requires_grad)
+        if not (graph or torch.compiler.is_compiling()) and (
+            isinstance(self.transform, Haar) and math.prod(_size(test)) >= 2 * BAND
+        ):
+            return self._accumulated_in_bands(test, reference, self.transform)
         return self.compare(self.represent(test), self.represent(reference))
+
+    def _accumulated_in_bands(self, test: Tensor, reference: Tensor, haar: Haar) -> Tensor:
+        """Return the same of large images, the finest levels band by band.
+
+        A band stays in the processor's cache, and its memory is used again for the next one, where
+        whole planes would be asked from the system anew in every call.
+        """
+        size, octaves = _size(test), BAND_LEVELS
+        options = self._fast, self.observer.true_means
+        constants = self._constants(test.dtype)
+        # For each level, coarser first, what its nodes have in each band.
+        fine: list[list[Tensor]] = [[] for _ in range(octaves)]
+        # For each image, the means of nodes of 2^octaves pixels, and those of rows.
+        means: tuple[list[Tensor], list[Tensor]] = [], []
+        means_of_rows: tuple[list[Tensor], list[Tensor]] = [], []
+        for band in Tiling.bands(size, BAND, octaves, haar.reach + 1):
+            bands: list[Cortex] = []
+            for number, image in enumerate((test, reference)):
+                cones = self._cone_planes(cut(image, band.around))
+                # One level more, for the parents of the last.
+                cortex = haar.begin(cones, octaves + 1, *options)
+                means[number].append(cut(cortex.lowpass[1], band.within(2**octaves)))
+                means_of_rows[number].append(cut(cones, band.within(1)).mean(-1, keepdim=True))
+                bands.append(cortex)
+            for number, level in enumerate(self._levels(bands[0], constants)):
+                if number > 0:
+                    local = self._local_difference(bands[0], bands[1], number, level, constants)
+                    node = 2 ** (octaves + 1 - number)
+                    fine[number - 1].append(cut(local, band.within(node)))
+        first, second = (
+            haar.coarser(
+                torch.cat(parts, -2), octaves, size, mean_of(torch.cat(rows, -2)), *options
+            )
+            for parts, rows in zip(means, means_of_rows, strict=True)
+        )
+        coarse, root = self._differences(first, second)
+        return accumulate([*coarse, *(torch.cat(planes, -2) for planes in fine)], root)
 
     def _to_pixels(self, plane: Tensor, size: tuple[int, int]) -> Tensor:
         # The leaves of overlapping nodes are the pixels.
@@ -257,7 +306,7 @@ class VDM(TiledMetric):
             planes: Tensor = compiled(_light)(image, *around)
             return planes
         rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
-        return torch.cat([_light(part, *around) for part in image.split(rows, -2)], -2)
+        return torch.cat([self._kept(_light, part, *around) for part in image.split(rows, -2)], -2)
 
     def respond(self, cortex: Cortex) -> tuple[Tensor, ...]:
         """Return the responses of one image: chromatic aberration to the transducer.
@@ -366,14 +415,19 @@ class VDM(TiledMetric):
         local = []
         for plane in range(0, orientations, at_once):
             some = slice(plane, plane + at_once)
-            difference = respond(
+            arguments = (
                 details[:, :, some],
                 others[:, :, some],
                 sight.of(some),
                 other_sight.of(some),
                 *self._options(constants),
             )
-            local.append(self._gathered(difference, constants["summation_exponent"], fast))
+
+            def gathered(*arguments: Any) -> Tensor:
+                difference = respond(*arguments)
+                return self._gathered(difference, constants["summation_exponent"], fast)
+
+            local.append(self._kept(gathered, *arguments))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]
 
     def _options(self, constants: dict[str, Tensor]) -> tuple[Tensor, Tensor, bool, bool, int]:

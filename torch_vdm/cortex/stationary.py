@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torch_vdm.cortex.haar import Haar, levels
-from torch_vdm.cortex.transform import Cortex
+from torch_vdm.cortex.transform import Cortex, mean_of
 from torch_vdm.fast import SMALLEST, compiled
 from torch_vdm.quadtree import share
 
@@ -48,7 +48,7 @@ class StationaryHaar:
             pixel (2^k y, 2^k x) of level k from the finest, or 2^(k - 1) after it.
         """
         size = (planes.shape[-2], planes.shape[-1])
-        mean = planes.mean((-2, -1), keepdim=True)
+        mean = mean_of(planes)
         details, means = levels(planes, 1, size, fast, true_means)
         # The means of nodes of 1, 1, 2, 4 ... pixels: halves of the finest, quarters of all others.
         parts = [planes, planes, *means][: len(details)]

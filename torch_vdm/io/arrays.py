@@ -73,7 +73,7 @@ class ArrayFile:
 
     def _array(self) -> NDArray[Any]:
         try:
-            array = np.load(self.path, mmap_mode="r")
+            array: NDArray[Any] = np.load(self.path, mmap_mode="r")
         except (OSError, ValueError, EOFError) as error:
             self._refuse(f"damaged or no array: {' '.join(str(error).split())}; write it again")
         if array.ndim == 3 and array.shape[0] != 3 and array.shape[2] == 3:
