@@ -461,6 +461,7 @@ def _verdict(table: dict[str, Any]) -> str:
 
 
 def _plot(result: dict[str, Any], path: Path) -> None:
+    from matplotlib import colormaps
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -469,12 +470,13 @@ def _plot(result: dict[str, Any], path: Path) -> None:
     FigureCanvasAgg(figure)
     axis = figure.subplots()
     names = [*SCENES, *RENDERED]
+    colours = colormaps["tab20"](range(len(names)))
     for row, table in enumerate(tables):
         for name, runs in table["scenes"].items():
             ratios = [run["true"] / table["tolerance"] for run in runs]
             order = list(table["scenes"])
             height = row + 0.07 * (order.index(name) - 0.5 * len(order))
-            colour = f"C{names.index(name)}"
+            colour = colours[names.index(name)]
             marker = "." if name in SCENES else "x"
             new = all(name not in earlier["scenes"] for earlier in tables[:row])
             label = name if new else None
@@ -483,7 +485,10 @@ def _plot(result: dict[str, Any], path: Path) -> None:
     axis.set_yticks(range(len(tables)), labels=[table["title"] for table in tables], fontsize=8)
     axis.invert_yaxis()
     axis.set_xlabel("true maximum / tolerance")
-    axis.set_xlim(left=0.0)
+    axis.set_xscale("log")
+    ticks = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 50.0)
+    axis.set_xticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+    axis.minorticks_off()
     axis.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     axis.spines[["top", "right"]].set_visible(False)
     figure.savefig(path)
