@@ -61,7 +61,8 @@ def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
         second, fourth = scalar_second(parent[:6]), parent[6]
         kurtosis = _ratio(fourth, second * second, NORMAL)
         freedom = 2.0 * nodes[11] / np.maximum(kurtosis - 1.0, 1e-3)
-        black = _chance_of_light(own, own_mean, freedom)
+        # Not of a single pixel: beside pixels with light it is a few samples from having some.
+        black = _chance_of_light(own, own_mean, freedom) if levels else np.ones_like(freedom)
         # The mean, which scales what the parent knows, is shrunk by the least weight.
         weight = black * PRIOR / (PRIOR + freedom)
         mean = weight * parent_mean + (1.0 - weight) * own_mean
