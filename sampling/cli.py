@@ -108,7 +108,9 @@ def _parser() -> argparse.ArgumentParser:
     scene = parser.add_argument_group("scene")
     scene.add_argument("--effects", choices=("auto", "full"), default="auto")
     scene.add_argument(
-        "--aov", action="store_true", help="write albedo and shading normal, from the same rays"
+        "--aov",
+        action="store_true",
+        help="write albedo, shading normal and depth, from the same rays",
     )
     scene.add_argument(
         "--variant", choices=("auto", *VARIANTS), default="auto", help="of Mitsuba (auto)"

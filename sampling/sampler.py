@@ -30,6 +30,11 @@ STATE_VERSION = 1
 # Share of the tolerance that a round aims at, for a prediction is not exact. Status: choice.
 AIM = 0.98
 
+# An image in which no sample has met any light may have missed it all. It is not finished before a
+# pixel has so many samples, which grow by this factor a round. Status: choice; a light of 1 in 1000
+# on four pixels of a black image then stays unseen in one run of ten million.
+UNLIT, UNLIT_GROWTH = 4096, 4.0
+
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
@@ -293,7 +298,7 @@ class Sampler:
         """End a round: predict, then stop, or say how many samples every pixel is to have."""
         statistics = self._statistics
         model = Model(self.metric, statistics, self.size)
-        predicted = model.predicted_maximum()
+        predicted = model.predicted_maximum(self.settings.tolerance)
         totals = model.totals()
         largest = float(totals.max()) ** (1.0 / model.exponent)
         # The boundary images say where, the simulation how much.
@@ -343,9 +348,16 @@ class Sampler:
         """Return why the samples are enough, None where they are not."""
         threshold = self.settings.noise_threshold
         if threshold is None:
-            return "tolerance" if predicted <= self.settings.tolerance else None
+            enough = predicted <= self.settings.tolerance and not self._unlit()
+            return "tolerance" if enough else None
         noise = HalfBuffer().noise(self._statistics, self.size)
         return "noise_threshold" if noise.max() <= threshold else None
+
+    def _unlit(self) -> bool:
+        """Return whether all samples were black, and too few to believe it."""
+        statistics = self._statistics
+        seen = statistics.count.max()
+        return bool(0 < seen < UNLIT and not statistics.mean.any())
 
     def _wanted(self, model: Model, scale: float) -> Plane:
         """Return how many finite samples every pixel is to have, (H, W)."""
@@ -355,6 +367,8 @@ class Sampler:
             growth = np.clip((noise / threshold) ** 2, SMALLEST_GROWTH, LARGEST_GROWTH)
             alone: Plane = model.count * np.where(noise > threshold, growth, 1.0)
             return alone
+        if self._unlit():
+            return UNLIT_GROWTH * model.count
         goal = (AIM * self.settings.tolerance / scale) ** model.exponent
         wanted = self._strategy.wanted(model, self._statistics, goal)
         if not (wanted > model.count).any():

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from sampling.statistics import FIRST, SECOND, Statistics, scalar_second
-from torch_vdm.quadtree import push
 
 Plane = NDArray[np.float64]
 
@@ -57,20 +56,24 @@ def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
     while levels:
         nodes = levels.pop()
         own, own_mean = _own(nodes)
-        parent, parent_mean = _push(estimate, nodes.shape[1:]), _push(mean, nodes.shape[1:])
-        second, fourth = scalar_second(parent[:6]), parent[6]
-        kurtosis = _ratio(fourth, second * second, NORMAL)
+        squares = np.concatenate((mean * mean, scalar_second(estimate[:6])[None] ** 2))
+        between = _between(np.concatenate((estimate, mean, squares)), nodes)
+        parent, parent_mean = between[:7], between[7:10]
+        # Over means of squares, and not squares of means: else a node near a lamp would have its
+        # noise but neither its light nor the kurtosis of it.
+        kurtosis = _ratio(parent[6], between[13], NORMAL)
         freedom = 2.0 * nodes[11] / np.maximum(kurtosis - 1.0, 1e-3)
-        # Not of a single pixel: beside pixels with light it is a few samples from having some.
-        black = _chance_of_light(own, own_mean, freedom) if levels else np.ones_like(freedom)
-        # The mean, which scales what the parent knows, is shrunk by the least weight.
-        weight = black * PRIOR / (PRIOR + freedom)
+        # The mean, which scales what the parents know, is shrunk by the least weight.
+        weight = PRIOR / (PRIOR + freedom)
         mean = weight * parent_mean + (1.0 - weight) * own_mean
-        scale = np.minimum(_ratio(np.abs(mean), np.abs(parent_mean), 1.0), LARGEST_SCALE)
-        scalar = scale.mean(0)
-        prior = parent * np.concatenate((scale[FIRST] * scale[SECOND], scalar[None] ** 4))
+        chance = (1.0 - weight) ** 2 * parent[:6][FIRST == SECOND] / np.maximum(nodes[11], 1.0)
+        known = np.sqrt(between[10:13] + chance)
+        scale = np.minimum(_ratio(np.abs(mean), known, 1.0), LARGEST_SCALE)
+        covariance = parent[:6] * scale[FIRST] * scale[SECOND]
+        fourth = kurtosis * scalar_second(covariance) ** 2
+        prior = np.concatenate((covariance, fourth[None]))
         worth = _worth(scalar_second(own[:6]), scalar_second(prior[:6]), freedom)
-        weight = black * worth / (worth + freedom)
+        weight = _chance_of_light(own, own_mean, freedom) * worth / (worth + freedom)
         estimate = weight * prior + (1.0 - weight) * own
     return estimate[:6]
 
@@ -130,6 +133,13 @@ def _four(plane: Plane) -> Plane:
     return total
 
 
-def _push(plane: Plane, size: tuple[int, ...]) -> Plane:
-    """Give every child on a plane of ``size`` = (h, w) the value of its parent."""
-    return push(torch.from_numpy(plane)[None], (size[0], size[1]))[0].numpy()
+def _between(parents: Plane, nodes: Plane) -> Plane:
+    """Give every node what its four nearest parents have, by their distance (bilinear).
+
+    Its own parent alone would know nothing of what lies across the border of a large node: pixels
+    beside that border stayed at no variance where rare light ended there.
+    """
+    height, width = nodes.shape[1:]
+    tensor = torch.from_numpy(parents)[None]
+    between = functional.interpolate(tensor, scale_factor=2.0, mode="bilinear")
+    return between[0, :, :height, :width].numpy()

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -278,3 +279,33 @@ def test_an_unknown_accuracy_is_refused(pair: Pair, capsys: pytest.CaptureFixtur
     told = one_line_error(capsys, "compare", *pair, "--accuracy", "best")
     assert "fast" in told
     assert "reference" in told
+
+
+def test_tiles_give_the_same_figures(
+    pair: Pair, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = run_json(capsys, *pair)
+    tiled = run_json(capsys, *pair, "--tile", "8")
+    assert "--tile 8" in str(tiled["reproduce"])
+    for name in ("max_jnd", "mean_jnd", "p95_jnd", "visible_fraction", "score_jnd"):
+        assert tiled[name] == pytest.approx(whole[name], abs=1e-5)
+    assert "4 or more" in one_line_error(capsys, "compare", *pair, "--tile", "2")
+    # Arrays on a disk, the codes of the same pictures: whole, and in tiles.
+    arrays = []
+    for name, path in zip(("reference", "test"), pair, strict=True):
+        codes = (255.0 * read_image(path)).round().to(torch.uint8)
+        np.save(tmp_path / f"{name}.npy", codes.permute(1, 2, 0).numpy())
+        arrays.append(str(tmp_path / f"{name}.npy"))
+    figure = str(tmp_path / "map.png")
+    for paths in (arrays, [pair[0], arrays[1]]):
+        for extra in ([], ["--tile", "8", "--map", figure]):
+            told = run_json(capsys, *paths, *extra)
+            assert told["max_jnd"] == pytest.approx(whole["max_jnd"], abs=1e-5)
+            assert told["mean_luminance_change"] == pytest.approx(whole["mean_luminance_change"])
+    assert "read part by part" in str(told["assumptions"])
+    linear = str(tmp_path / "linear.npy")
+    np.save(linear, np.full((3, 20, 30), 0.5, np.float32))
+    told = run_json(capsys, linear, pair[1], "--tile", "8")
+    assert told["max_jnd"] == pytest.approx(run_json(capsys, linear, pair[1])["max_jnd"], abs=1e-5)
+    np.save(linear, np.full((3, 20, 30), np.nan, np.float32))
+    assert "linear.npy: expected finite" in one_line_error(capsys, "compare", linear, linear)

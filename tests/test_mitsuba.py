@@ -168,7 +168,7 @@ def test_the_mean_is_that_of_mitsubas_own_image(
     assert abs(z.mean()) < NormalDist().inv_cdf(1.0 - 1e-3 / 2.0) / math.sqrt(z.size / 3.0)
 
 
-def test_albedo_and_normals_come_along(still_life: Path) -> None:
+def test_albedo_normals_and_depth_come_along(still_life: Path) -> None:
     renderer = MitsubaRenderer(still_life, {"width": "18", "height": "12"}, aov=True)
     draw(renderer, 4)
     draw(renderer, 5, first=4)
@@ -177,6 +177,8 @@ def test_albedo_and_normals_come_along(still_life: Path) -> None:
     assert wall == pytest.approx((0.46, 0.50, 0.52), abs=1e-6)
     normal = tuple(aovs[f"normal.{name}"][0, 0] for name in "XYZ")
     assert normal == pytest.approx((0.0, 0.0, 1.0), abs=1e-6)
+    # The wall is 8.8 from the eye, at z = -2.2; rays to the corner are longer.
+    assert 8.8 < aovs["depth.Z"][0, 0] < 1.2 * 8.8
 
 
 def test_radiance_that_is_not_finite_is_handed_on(mitsuba: Any, tmp_path: Path) -> None:

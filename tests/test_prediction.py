@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sampling.prediction import Model, _factor, _shrunk
+from sampling.prediction import MOST_DRAWS, Model, _factor, _shrunk
 from sampling.renderers.synthetic import Synthetic
 from sampling.statistics import FIRST, SECOND, Statistics
 from torch_vdm import VDM, Display, Observer
@@ -110,3 +110,21 @@ def test_it_is_a_function_of_the_statistics() -> None:
     metric = VDM(60.0, Display.linear())
     found = [Model(metric, drawn(renderer, 32), (16, 16)).simulated() for _ in range(2)]
     np.testing.assert_array_equal(found[0], found[1])
+
+
+def test_far_over_the_tolerance_only_a_quarter_is_simulated() -> None:
+    """And these are the first of all; at the tolerance, none is left out."""
+    renderer = wall()
+    model = Model(VDM(60.0, Display.linear()), drawn(renderer, 32), renderer.size)
+    every = model.simulated()
+    assert len(every) == MOST_DRAWS
+    few = model.simulated(tolerance=0.5 * every.mean())
+    np.testing.assert_array_equal(few, every[: MOST_DRAWS // 4])
+    np.testing.assert_array_equal(model.simulated(tolerance=1.5 * every.mean()), every)
+    assert model.predicted_maximum(0.5 * every.mean()) > 0.5 * every.mean()
+
+
+def test_an_image_of_no_noise_has_exactly_no_difference() -> None:
+    still = Synthetic(np.full((8, 8, 3), 0.3), np.zeros((8, 8, 3)), np.ones((8, 8)))
+    model = Model(VDM(60.0, Display.linear()), drawn(still, 4), still.size)
+    assert model.predicted_maximum() == 0.0

@@ -96,7 +96,7 @@ def test_the_image_and_the_figures(whole: tuple[list[str], Path]) -> None:
     assert (told["plan"]["integrator"], told["plan"]["max_depth"]) == ("path", 4)
     assert told["seconds_render"] + told["seconds_metric"] <= told["seconds_total"]
     aovs = {*(f"albedo.{name}" for name in "RGB"), *(f"normal.{name}" for name in "XYZ")}
-    assert set(planes) == CHANNELS | aovs
+    assert set(planes) == CHANNELS | aovs | {"depth.Z"}
     assert {plane.shape for plane in planes.values()} == {(8, 12)}
     assert planes["samples"].sum() == told["samples_total"]
     assert told["spp_mean"] == pytest.approx(told["samples_total"] / (12 * 8))

@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from torch_vdm.report import Comparison, figures, write_heat_map
+from torch_vdm.report import Comparison, _shrunk_map, figures, shrunk, write_heat_map
 
 
 def comparison(**changes: object) -> Comparison:
@@ -32,6 +32,30 @@ def test_figures_are_those_of_numpy() -> None:
     assert told["visible_fraction"] == (values > 1.0).mean()
 
 
+def test_figures_of_many_bands_are_those_of_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch_vdm.report.BAND", 50)
+    for jnd in (torch.rand(37, 20) ** 4, torch.zeros(9, 11), torch.rand(1, 1)):
+        values, told = jnd.numpy(), figures(jnd)
+        assert told["p95_jnd"] == np.quantile(values, 0.95, method="inverted_cdf")
+        y, x = divmod(int(values.argmax()), values.shape[1])
+        assert told["max_jnd"] == values.max()
+        assert told["max_pixel"] == (x, y)
+        assert told["mean_jnd"] == pytest.approx(values.mean(dtype=np.float64))
+
+
+def test_the_picture_of_a_large_map_keeps_its_largest_value() -> None:
+    jnd = torch.zeros(3, 5000)
+    jnd[1, 4321] = 7.0
+    small = _shrunk_map(jnd)
+    assert small.shape == (3, 1000)
+    assert small[1, 864] == 7.0
+    assert small.sum() == 7.0
+    image = torch.rand(3, 7, 2401)
+    expected = image[..., :2400].unflatten(-1, (800, 3)).mean(-1)
+    torch.testing.assert_close(shrunk(image)[..., :-1], expected)
+    torch.testing.assert_close(shrunk(image)[..., -1], image[..., -1])
+
+
 def test_verdicts() -> None:
     assert "up to 3.2 JND (at x 4, y 5), in 25.0% of the image" in comparison().verdict()
     assert "under 0.1%" in comparison(visible_fraction=1e-4).verdict()
@@ -41,7 +65,7 @@ def test_verdicts() -> None:
     assert invisible.startswith("Nobody will see a difference at 60 pixels per degree")
 
 
-@pytest.mark.parametrize("size", [(1, 1), (64, 40), (30, 300)])
+@pytest.mark.parametrize("size", [(1, 1), (64, 40), (30, 300), (3, 8192)])
 def test_heat_map_is_a_picture(size: tuple[int, int], tmp_path: Path) -> None:
     image = torch.rand(3, *size)
     path = tmp_path / "map.png"

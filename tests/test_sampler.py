@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sampling import Report, Request, Sampler, Samples, Settings, rounds
 from sampling.renderers.synthetic import Synthetic
+from sampling.sampler import UNLIT
 from sampling.statistics import PIECE
 from sampling.strategies import STRATEGIES
 from torch_vdm import VDM, Display, Observer
@@ -161,6 +162,29 @@ def test_reports_add_up() -> None:
         assert report.over == (report.jnd > 4.0).mean()
     assert reports[-1].samples == sampler.count.sum()
     assert reports[-1].predicted <= 4.0
+
+
+def test_a_black_image_is_not_believed_at_once() -> None:
+    """A light of 1 in 1000 on 16 pixels of a black image: most pilots do not meet it."""
+    light = np.zeros((*SIZE, 3))
+    light[2:6, 2:6] = 0.003
+    missed = 0
+    for seed in range(6):
+        renderer = Synthetic(0.0 * light, light, np.full(SIZE, 0.001), seed)
+        sampler = Sampler(SIZE, METRIC, Settings(tolerance=6.0))
+        reports = finished(sampler, renderer)
+        missed += reports[0].predicted == 0.0
+        assert reports[-1].converged
+        assert true_maximum(sampler.image, renderer.mean, METRIC) < 6.0
+    assert missed >= 3
+
+
+def test_a_black_scene_ends() -> None:
+    black = np.zeros((*SIZE, 3))
+    sampler = Sampler(SIZE, METRIC)
+    reports = finished(sampler, Synthetic(black, black, np.ones(SIZE)))
+    assert reports[-1].converged
+    assert UNLIT <= sampler.count.min() == sampler.count.max() < 4 * UNLIT
 
 
 class Spoilt:

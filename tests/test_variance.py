@@ -75,6 +75,23 @@ def test_a_dark_pixel_beside_a_bright_one_keeps_its_scale() -> None:
     assert (shrunk[:, :8] / truth[:, :8]).max() < 10.0
 
 
+def test_rare_light_is_known_across_the_border_of_a_large_node() -> None:
+    """A row of pixels above the middle, lit as those below: they alone in their half of the tree.
+
+    With 1 event in 1000 samples and 500 samples a pixel, five pixels have seen nothing in 8 % of
+    runs; without their neighbours across the border they were left at 1e-4 of their variance.
+    """
+    light = np.zeros((32, 32, 3))
+    light[15:22, 10:20] = 0.003
+    chance = np.full((32, 32), 0.001)
+    found = []
+    for seed in range(12):
+        renderer = Synthetic(0.0 * light, light, chance, seed)
+        shrunk = green(pooled_covariance(drawn(renderer, 500), renderer.size))
+        found.append(shrunk[15, 10:20].min() / renderer.covariance[15, 15, 1, 1])
+    assert min(found) > 0.1
+
+
 def test_it_scales_with_the_radiance() -> None:
     samples = wall(0.1).sample(np.arange(256), np.zeros(256, np.int64), np.full(256, 16))
     found = []
@@ -135,8 +152,10 @@ def test_a_black_background_beside_a_seldom_hit_light_is_known_to_be_black() -> 
     pooled = pooled_covariance(statistics, size)[0]
     true = renderer.covariance[0, 0, 0, 0]
     assert pooled[:, :16].mean() == pytest.approx(true, rel=0.1)
-    # Blocks of black pixels have not been hit where as many beside them were, hundreds of times.
-    assert pooled[:, 16:].max() < 1e-12 * true
+    # Blocks of black pixels have not been hit where as many beside them were, hundreds of times;
+    # those at the border are still doubted a little.
+    assert pooled[:, 16].max() < 1e-3 * true
+    assert pooled[:, 18:].max() < 1e-5 * true
     # But a single pixel that has not been hit is not black for that.
     unlit = (statistics.mean[0].reshape(size) == 0.0)[:, :16]
     assert unlit.any()

@@ -7,12 +7,13 @@ import math
 import os
 import shlex
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import torch
 from torch import Tensor
@@ -26,9 +27,11 @@ from torch_vdm.display import (
     encode_srgb,
     pixels_per_degree,
 )
-from torch_vdm.io import ImageError, atomic_path, check_target, load, write_image
+from torch_vdm.io import ArrayFile, ImageError, atomic_path, check_target, load, write_image
+from torch_vdm.io.arrays import MAGIC
 from torch_vdm.observer import Observer
-from torch_vdm.report import Comparison, figures, table, write_heat_map
+from torch_vdm.report import BAND, Comparison, figures, shrunk, table, write_heat_map
+from torch_vdm.tiling import SMALLEST_TILE, TILE, Source, read
 from torch_vdm.vdm import VDM
 
 DONE, EXCEEDED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -37,6 +40,10 @@ DONE, EXCEEDED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 # 27-inch screen of 3840 x 2160 from 0.53 m; 100 cd/m2 is the white of BT.1886 and Display.srgb.
 PPD = 60.0
 WHITE = 100.0
+
+# Images of more pixels are compared in tiles, if nothing else is asked: whole, one of them would
+# take four gigabytes. Status: choice.
+LARGEST_WHOLE = 2**24
 
 # How the image is decomposed: what accuracy costs.
 TRANSFORMS: dict[str, type[Transform]] = {
@@ -105,7 +112,7 @@ def _parser() -> argparse.ArgumentParser:
     compare = commands.add_parser(
         "compare",
         help="compare a test image with a reference",
-        description="Compare two images of one size, PNG, JPEG or EXR, in just-noticeable "
+        description="Compare two images of one size, PNG, JPEG, EXR or NPY, in just-noticeable "
         "differences. Exit status: 0 done, 1 --fail-above exceeded, 2 bad input.",
     )
     compare.add_argument("reference", type=Path, metavar="REFERENCE")
@@ -156,6 +163,13 @@ def _add_options(parser: argparse.ArgumentParser, map_path: Path | None) -> None
         "blocks; reference: oriented quadrature pairs, no phase",
     )
     model.add_argument("--observer", choices=tuple(OBSERVERS), default="calibrated")
+    model.add_argument(
+        "--tile",
+        type=_tile,
+        metavar="N",
+        help=f"compare in tiles of N x N pixels, for images larger than memory: the same answer; "
+        f"{TILE} over {LARGEST_WHOLE / 1e6:.0f} megapixels, below none",
+    )
     reading = parser.add_argument_group("reading")
     reading.add_argument("--part", metavar="NAME", help="part of a multi-part EXR, name or number")
     reading.add_argument("--nonfinite", choices=("raise", "zero"), default="raise")
@@ -174,44 +188,78 @@ def _add_options(parser: argparse.ArgumentParser, map_path: Path | None) -> None
 class _Pair:
     """Two images made ready for one display."""
 
-    reference: Tensor
-    test: Tensor
+    reference: Source
+    test: Source
     display: Display
     assumptions: list[str]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        height, width = self.reference.shape[-2:]
+        return height, width
 
     def luminances(self) -> tuple[float, float]:
         """Return the mean luminance of reference and test, in cd/m2."""
         matrix = torch.tensor(BT709_TO_XYZ, dtype=torch.float64)
-        reference, test = (
-            self.display.to_xyz(image[None].double(), matrix)[0, 1].mean().item()
-            for image in (self.reference, self.test)
-        )
-        return reference, test
+        height, width = self.size
+        rows = max(1, BAND // width)
+        sums = [0.0, 0.0]
+        for top in range(0, height, rows):
+            band = slice(top, min(top + rows, height)), slice(0, width)
+            for number, image in enumerate((self.reference, self.test)):
+                xyz = self.display.to_xyz(read(image, 0, band).double(), matrix)
+                sums[number] += xyz[0, 1].sum().item()
+        return sums[0] / (height * width), sums[1] / (height * width)
 
     def coded(self) -> tuple[Tensor, Tensor]:
-        """Return reference and test as sRGB-coded images, for a picture of them."""
+        """Return reference and test as sRGB-coded images, small enough for a picture of them."""
+        reference, test = shrunk(self.reference), shrunk(self.test)
         if self.display.encoding == "srgb" and self.display.exposure == 0.0:
-            return self.reference, self.test
+            return reference, test
         scale = 2.0**self.display.exposure
         linear = (
             decode_srgb(image) if self.display.encoding == "srgb" else image
-            for image in (self.reference, self.test)
+            for image in (reference, test)
         )
         reference, test = (encode_srgb(image * scale) for image in linear)
         return reference, test
 
 
+@dataclass(frozen=True)
+class _Linear:
+    """An sRGB-coded source as linear values, of which 1.0 is ``white`` where 1.0 was coded."""
+
+    source: Source
+    white: float
+
+    @property
+    def shape(self) -> Sequence[int]:
+        """(3, H, W)."""
+        return self.source.shape
+
+    def __getitem__(self, index: tuple[slice, slice, slice], /) -> Tensor:
+        """Return a part."""
+        return decode_srgb(read(self.source, 0, index[1:])[0]) * self.white
+
+
 def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
+    # For the map of a large image; one that cannot be removed is not worth a failure.
+    with tempfile.TemporaryDirectory(prefix="torch-vdm-", ignore_cleanup_errors=True) as room:
+        return _compare_with(Path(room), reference, test, options)
+
+
+def _compare_with(room: Path, reference: Path, test: Path, options: argparse.Namespace) -> int:
     check_outputs((reference, test), (options.map, json_path(options)))
     ppd, seen_from = _viewing(options)
     pair = _load_pair(reference, test, options)
     transform = TRANSFORMS[options.accuracy]()
     metric = VDM(ppd, pair.display, OBSERVERS[options.observer](), transform)
+    tile = options.tile
+    if tile is None and math.prod(pair.size) > LARGEST_WHOLE:
+        tile = TILE
     start = time.perf_counter()
-    with torch.no_grad():
-        batch = pair.test[None], pair.reference[None]
-        jnd = metric(*batch)[0, 0]
-        score = metric.score(*batch).item()
+    jnd, score = _in_tiles(metric, pair, tile, room) if tile else _whole(metric, pair)
     seconds = time.perf_counter() - start
     luminances = pair.luminances()
     comparison = Comparison(
@@ -227,7 +275,7 @@ def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
         seconds=seconds,
         assumptions=[seen_from, *pair.assumptions],
         version=__version__,
-        reproduce=_reproduce(reference, test, ppd, options),
+        reproduce=_reproduce(reference, test, ppd, tile, options),
     )
     if options.map is not None and options.map.suffix.lower() == ".exr":
         write_image(options.map, jnd)
@@ -242,6 +290,34 @@ def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
         tell(_text(comparison, luminances, options))
     exceeded = options.fail_above is not None and comparison.max_jnd > options.fail_above
     return EXCEEDED if exceeded else DONE
+
+
+def _whole(metric: VDM, pair: _Pair) -> tuple[Tensor, float]:
+    """Return the map (H, W) and the detection score."""
+    height, width = pair.size
+    everything = slice(0, height), slice(0, width)
+    batch = read(pair.test, 0, everything), read(pair.reference, 0, everything)
+    with torch.no_grad():
+        return metric(*batch)[0, 0], metric.score(*batch).item()
+
+
+def _in_tiles(metric: VDM, pair: _Pair, tile: int, room: Path) -> tuple[Tensor, float]:
+    """Return the same, with a progress bar on a terminal; the map lies in a file in ``room``."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    size = pair.size
+    jnd = torch.from_file(str(room / "map"), shared=True, size=math.prod(size)).view(1, *size)
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+
+        def shown(what: str) -> Callable[[int, int], None]:
+            task = bar.add_task(what, total=None)
+            return lambda done, steps: bar.update(task, completed=done, total=steps)
+
+        metric.tiled(pair.test, pair.reference, tile, jnd, shown("map"))
+        score = metric.tiled_score(pair.test, pair.reference, tile, shown("detection score"))
+    return jnd[0], score.item()
 
 
 def check_outputs(inputs: Sequence[Path], outputs: Sequence[Path | None]) -> None:
@@ -299,18 +375,40 @@ def _viewing(options: argparse.Namespace) -> tuple[float, str]:
     return PPD, f"{PPD:g} pixels per degree, for nothing was given (--ppd)"
 
 
+class _Opened(NamedTuple):
+    """An image in memory, or an array on a disk, and what was assumed to read it."""
+
+    pixels: Source
+    linear: bool
+    notes: tuple[str, ...]
+
+
+def _open(path: Path, options: argparse.Namespace) -> _Opened:
+    if _is_array(path):
+        array = ArrayFile(path, options.nonfinite, options.negative)
+        return _Opened(array, array.linear, array.notes)
+    image = load(
+        path,
+        part=_part(options.part),
+        nonfinite=options.nonfinite,
+        negative=options.negative,
+        quiet=True,
+    )
+    return _Opened(image.pixels, image.linear, image.notes)
+
+
+def _is_array(path: Path) -> bool:
+    # What cannot be opened is `load`'s to tell of; opening a pipe would wait for ever.
+    with contextlib.suppress(OSError, ValueError):
+        if path.is_file():
+            with path.open("rb") as file:
+                return file.read(len(MAGIC)) == MAGIC
+    return False
+
+
 def _load_pair(reference: Path, test: Path, options: argparse.Namespace) -> _Pair:
-    """Read both images and bring them to one display."""
-    images = [
-        load(
-            path,
-            part=_part(options.part),
-            nonfinite=options.nonfinite,
-            negative=options.negative,
-            quiet=True,
-        )
-        for path in (reference, test)
-    ]
+    """Read both images and bring them to one display; an array is read later, part by part."""
+    images = [_open(path, options) for path in (reference, test)]
     shapes = [tuple(image.pixels.shape) for image in images]
     if shapes[0] != shapes[1]:
         sizes = [f"{shape[2]} x {shape[1]}" for shape in shapes]
@@ -329,20 +427,24 @@ def _load_pair(reference: Path, test: Path, options: argparse.Namespace) -> _Pai
     if not any(image.linear for image in images):
         display = Display.srgb(options.peak, options.exposure)
         return _Pair(images[0].pixels, images[1].pixels, display, assumptions)
+    scale = options.peak / options.white
     one, other = (
-        image.pixels if image.linear else decode_srgb(image.pixels) * (options.peak / options.white)
-        for image in images
+        image.pixels if image.linear else _Linear(image.pixels, scale) for image in images
     )
     return _Pair(one, other, Display.linear(options.white, options.exposure), assumptions)
 
 
-def _reproduce(reference: Path, test: Path, ppd: float, options: argparse.Namespace) -> str:
+def _reproduce(
+    reference: Path, test: Path, ppd: float, tile: int | None, options: argparse.Namespace
+) -> str:
     """Return the command that gives the same figures, with nothing left to defaults."""
     words = ["torch-vdm", "compare", str(reference), str(test)]
     words += ["--ppd", repr(ppd), "--peak", repr(options.peak), "--white", repr(options.white)]
     words += ["--exposure", repr(options.exposure), "--accuracy", options.accuracy]
     words += ["--observer", options.observer, "--nonfinite", options.nonfinite]
     words += ["--negative", options.negative]
+    if tile is not None:
+        words += ["--tile", str(tile)]
     if options.part is not None:
         words += ["--part", options.part]
     return shlex.join(words)
@@ -415,6 +517,14 @@ def _resolution(text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT in pixels, got {text!r}")
     return int(width), int(height)
+
+
+def _tile(text: str) -> int:
+    if not text.isdecimal() or int(text) < SMALLEST_TILE:
+        raise argparse.ArgumentTypeError(
+            f"expected a number of pixels, {SMALLEST_TILE} or more, got {text!r}"
+        )
+    return int(text)
 
 
 def _map_path(text: str) -> Path:

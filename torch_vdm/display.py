@@ -97,13 +97,15 @@ class Display:
         Tensor
             (B, 3, H, W), within +-1e12 cd/m2.
         """
+        if self.encoding == "xyz":
+            return image.clamp(-BRIGHTEST, BRIGHTEST)
+        limit = BRIGHTEST / self.gain
         if self.encoding == "srgb":
             image = decode_srgb(image)
-        if self.encoding != "xyz":
-            # The gain goes into nine numbers instead of every pixel.
-            limit = BRIGHTEST / self.gain
-            return mix(primaries * self.gain, image.clamp(-limit, limit))
-        return image.clamp(-BRIGHTEST, BRIGHTEST)
+        if self.encoding == "linear" or limit < LARGEST_CODE**SRGB_EXPONENT:
+            image = image.clamp(-limit, limit)
+        # The gain goes into nine numbers instead of every pixel.
+        return mix(primaries * self.gain, image)
 
     def to_code(self, image: Tensor) -> Tensor:
         """Return sRGB-coded values: those of an sRGB display, or of light over white.
@@ -128,12 +130,13 @@ def encode_srgb(light: Tensor) -> Tensor:
 
 def decode_srgb(image: Tensor) -> Tensor:
     """Return the linear values of sRGB-coded ones (IEC 61966-2-1), 1.0 to 1.0."""
-    image = image.clamp(-LARGEST_CODE, LARGEST_CODE)
     # The power never sees a base whose gradient is not finite. It is written in base 2, which is
-    # the processor's own: twice as fast, and as exact.
-    base = (image.clamp_min(SRGB_KNEE) + SRGB_OFFSET) * (1.0 / (1.0 + SRGB_OFFSET))
+    # the processor's own: twice as fast, and as exact. Both parts take the image itself, which a
+    # backward pass has anyway.
+    base = (image.clamp(SRGB_KNEE, LARGEST_CODE) + SRGB_OFFSET) * (1.0 / (1.0 + SRGB_OFFSET))
     power = torch.exp2(SRGB_EXPONENT * torch.log2(base))
-    return torch.where(image <= SRGB_KNEE, image * (1.0 / SRGB_SLOPE), power)
+    straight = image.clamp_min(-LARGEST_CODE) * (1.0 / SRGB_SLOPE)
+    return torch.where(image <= SRGB_KNEE, straight, power)
 
 
 def pixels_per_degree(

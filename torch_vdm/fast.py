@@ -22,19 +22,24 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     it one item at a time, and tensors that are no views, for it is specialised on offsets too.
     """
     # Imported where it is used: it takes longer than the rest of the package.
-    from torch._dynamo import config as _dynamo_config
-    from torch.fx.experimental import _config
+    from torch._dynamo import config as dynamo
+    from torch.fx.experimental import _config as shapes
 
     specialised = torch.compile(function, dynamic=True, fullgraph=True)
 
     def call(*arguments: object) -> Any:
         if torch.compiler.is_compiling():
             return function(*arguments)
-        # Without the first, two sides that are equal in the first image are held equal for ever,
-        # and the first image that is not square compiles everything again. The second allows for
-        # every mix of precision, gradients, display, observer and effects in one process.
-        no_duck_shape = _config.patch(use_duck_shape=False)  # type: ignore[attr-defined]
-        with no_duck_shape, _dynamo_config.patch(recompile_limit=MOST_FORMS):
+        # Set and restored by hand: the context managers for it cost as much as the call.
+        before = shapes.use_duck_shape, dynamo.recompile_limit
+        # Else two sides that are equal in the first image would be held equal for ever, and the
+        # first image that is not square would compile everything again.
+        shapes.use_duck_shape = False
+        # For every mix of precision, gradients, display, observer and effects in one process.
+        dynamo.recompile_limit = MOST_FORMS
+        try:
             return specialised(*arguments)
+        finally:
+            shapes.use_duck_shape, dynamo.recompile_limit = before
 
     return call

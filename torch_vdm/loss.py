@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from torch_vdm.display import Display
 from torch_vdm.observer import Observer
-from torch_vdm.pair import finite_in_both
 from torch_vdm.vdm import VDM
 
 Reduction = Literal["mean", "sum", "none"]
@@ -48,6 +47,9 @@ class VDMLoss(nn.Module):
         Weight of the L1 term; 0: the metric alone.
     reduction
         Over the batch: "mean", "sum", or "none" for one value an item, (B,).
+    checkpoint
+        Whether to keep little for the backward pass and compute the rest again there: half the
+        memory for a third more time, with the same gradients. Not with `torch.func`.
 
     Raises
     ------
@@ -61,6 +63,7 @@ class VDMLoss(nn.Module):
         display: Display | None = None,
         l1: float = L1,
         reduction: Reduction = "mean",
+        checkpoint: bool = False,
         **options: Any,
     ) -> None:
         super().__init__()
@@ -71,6 +74,7 @@ class VDMLoss(nn.Module):
         if options.get("observer") is None:
             options["observer"] = replace(Observer.calibrated(), dark_light=DARK_LIGHT)
         self.metric = VDM(ppd, display, **options)
+        self.metric._checkpointed = bool(checkpoint)
         self.l1 = l1
         self.reduction = reduction
 
@@ -80,12 +84,10 @@ class VDMLoss(nn.Module):
         ``mask`` (B, 1, H, W) weights the pixels, 0 to leave one out; a pixel that is left out
         still is what its neighbours are seen against.
         """
-        plane = torch.log1p(self.metric.power(test, reference))
-        if self.l1:
-            if self.metric.nonfinite == "mask":
-                test, reference, _ = finite_in_both(test, reference)
-            difference = self._coded(test, plane.dtype) - self._coded(reference, plane.dtype)
-            plane = plane + self.l1 * difference.abs().mean(1, keepdim=True)
+        test, reference, seen = self.metric._checked(test, reference)
+        # The L1 term first: what it needs on the way is gone when the metric needs most.
+        l1 = self.l1 * self.metric._kept(self._absolute, test, reference) if self.l1 else 0.0
+        plane = torch.log1p(self.metric._power(test, reference, seen)) + l1
         items = _mean(plane, mask)
         if self.reduction == "mean":
             return items.mean()
@@ -96,8 +98,11 @@ class VDMLoss(nn.Module):
         self.metric.compile(*args, **kwargs)
         return self
 
-    def _coded(self, image: Tensor, dtype: torch.dtype) -> Tensor:
-        return self.metric.display.to_code(image.to(dtype))
+    def _absolute(self, test: Tensor, reference: Tensor) -> Tensor:
+        """Return the mean absolute difference of sRGB-coded values, (B, 1, H, W)."""
+        display = self.metric.display
+        difference = display.to_code(test) - display.to_code(reference)
+        return difference.abs().mean(1, keepdim=True)
 
 
 def _mean(plane: Tensor, mask: Tensor | None) -> Tensor:

@@ -29,3 +29,11 @@ def mix(matrix: Tensor, planes: Tensor) -> Tensor:
         mixed = torch.addcmul(first * row[0], second, row[1])
         rows.append(torch.addcmul(mixed, third, row[2]))
     return torch.stack(rows, 1)
+
+
+def product(first: Tensor, second: Tensor) -> Tensor:
+    """Return the matrix that mixes by ``second``, then by ``first``; (3, 3) each.
+
+    Not by ``@``, for the reasons of `mix`.
+    """
+    return (first.unsqueeze(-1) * second).sum(1)

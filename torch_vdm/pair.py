@@ -1,10 +1,11 @@
 """What every metric of two images shares: its options, its checks, its precision."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from torch_vdm.display import Display
 from torch_vdm.distance import just_noticeable
@@ -43,6 +44,17 @@ class PairMetric(nn.Module):
         self.display = display or Display.srgb()
         self.nonfinite = nonfinite
         self._fast = False
+        self._checkpointed = False
+
+    def _kept(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a part of the forward pass, of which a checkpoint keeps the arguments alone.
+
+        What was computed on the way is then computed again in the backward pass. Compiled graphs
+        choose by themselves what they keep.
+        """
+        if not self._checkpointed or torch.compiler.is_compiling() or not torch.is_grad_enabled():
+            return function(*arguments)
+        return checkpoint(function, *arguments, use_reentrant=False, preserve_rng_state=False)
 
     def _accumulated(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the accumulated differences of two checked batches, (B, 1, h, w)."""
@@ -87,10 +99,11 @@ class PairMetric(nn.Module):
         Tensor
             (B, 1, H, W), JND.
         """
-        total, seen = self._total(test, reference)
+        test, reference, seen = self._checked(test, reference)
+        total = self._total(test, reference)
         constants = self._constants(total.dtype, "summation_exponent")
         jnd = just_noticeable(total, constants["summation_exponent"])
-        return _masked(self._to_pixels(jnd, (test.shape[-2], test.shape[-1])), seen)
+        return masked(self._to_pixels(jnd, (test.shape[-2], test.shape[-1])), seen)
 
     def power(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the accumulated differences before the root: the map to the power of 2.4.
@@ -98,18 +111,21 @@ class PairMetric(nn.Module):
         (B, 1, H, W), from (B, 3, H, W) twice. Smooth where the images are equal, so that a loss
         is taken from here; see `VDMLoss`.
         """
-        total, seen = self._total(test, reference)
-        return _masked(self._to_pixels(total, (test.shape[-2], test.shape[-1])), seen)
+        return self._power(*self._checked(test, reference))
+
+    def _power(self, test: Tensor, reference: Tensor, seen: Tensor | None) -> Tensor:
+        """Return `power` of two checked batches."""
+        total = self._total(test, reference)
+        return masked(self._to_pixels(total, (test.shape[-2], test.shape[-1])), seen)
 
     def _constants(self, dtype: torch.dtype, *names: str) -> dict[str, Tensor]:
         """Return constants in the precision of the computation: those named, or all."""
         buffers = {name: getattr(self, name) for name in names} or dict(self.named_buffers())
         return {name: value.to(dtype) for name, value in buffers.items()}
 
-    def _total(self, test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor | None]:
-        test, reference, seen = self._checked(test, reference)
+    def _total(self, test: Tensor, reference: Tensor) -> Tensor:
         totals = [self._accumulated(one, other) for one, other in self._parts(test, reference)]
-        return torch.cat(totals), seen
+        return torch.cat(totals)
 
     def _parts(self, test: Tensor, reference: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """Yield both batches, whole or, on the fast route, item by item."""
@@ -121,8 +137,13 @@ class PairMetric(nn.Module):
             for one, other in zip(test.split(1), reference.split(1), strict=True)
         )
 
-    def _checked(self, test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return both images in the computing precision, and where they are finite (masked)."""
+    def _checked(
+        self, test: Tensor, reference: Tensor, origin: tuple[int, int, int] = (0, 0, 0)
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return both images in the computing precision, and where they are finite (masked).
+
+        ``origin`` is where a part lies in a larger batch, for messages: item, y, x.
+        """
         for name, image in (("test", test), ("reference", reference)):
             if image.ndim != 4 or image.shape[1] != 3 or 0 in image.shape:
                 raise ValueError(
@@ -150,8 +171,8 @@ class PairMetric(nn.Module):
         if self.nonfinite == "mask":
             return finite_in_both(test, reference)
         if not torch.compiler.is_compiling():
-            _require_finite("test", test)
-            _require_finite("reference", reference)
+            _require_finite("test", test, origin)
+            _require_finite("reference", reference, origin)
         return test, reference, None
 
 
@@ -195,11 +216,12 @@ def _widened(image: Tensor, dtype: torch.dtype) -> Tensor:
     return widened
 
 
-def _masked(plane: Tensor, seen: Tensor | None) -> Tensor:
+def masked(plane: Tensor, seen: Tensor | None) -> Tensor:
+    """Return a plane with 0 where a mask (B, 1, H, W) is not set."""
     return plane if seen is None else torch.where(seen, plane, 0.0)
 
 
-def _require_finite(name: str, image: Tensor) -> None:
+def _require_finite(name: str, image: Tensor, origin: tuple[int, int, int]) -> None:
     """Raise where ``image`` has NaN or infinity, naming the first such item and pixel."""
     # One cheap pass: the sum of an image that is not finite is not.
     if bool(torch.isfinite(image.detach().sum())):
@@ -211,6 +233,7 @@ def _require_finite(name: str, image: Tensor) -> None:
     channel, y, x = bad[item].nonzero()[0].tolist()
     raise ValueError(
         f"expected finite pixel values, got {int(bad[item].sum())} NaN or infinite ones in the "
-        f"{name}'s batch item {item}, the first in channel {channel} at x {x}, y {y}; "
+        f"{name}'s batch item {item + origin[0]}, the first in channel {channel} "
+        f"at x {x + origin[2]}, y {y + origin[1]}; "
         'repair them or pass nonfinite="mask"'
     )

@@ -1,14 +1,18 @@
 """What a comparison says: its figures, its verdict, its table, its heat map."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
+import torch
 from torch import Tensor
+from torch.nn import functional
 
 from torch_vdm.distance import VISIBLE
 from torch_vdm.io import atomic_path
+from torch_vdm.tiling import Source, read
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -16,6 +20,15 @@ if TYPE_CHECKING:
 # What a heat map's colours are cut at where the largest difference is smaller, in JND, so that
 # invisible differences look like nothing. Status: choice.
 SMALLEST_SCALE = 2.0
+
+# Pixels of a map that are taken at once, and a side of a picture in a heat map, in pixels: more
+# would not be seen. Status: choice.
+BAND = 2**22
+LARGEST_PANEL = 1200
+
+# Images that are longer for their height, or higher, are drawn wider: a line shows nothing.
+# Status: choice.
+LONGEST = 16
 
 
 class Figures(TypedDict):
@@ -79,19 +92,74 @@ class Comparison:
 
 
 def figures(jnd: Tensor) -> Figures:
-    """Return the figures of a map (H, W)."""
-    values = jnd.flatten().double()
-    y, x = divmod(int(values.argmax()), jnd.shape[-1])
-    # The smallest value that at least 95 % of the pixels do not exceed; torch.quantile refuses
-    # more than 2^24 values.
-    rank = max(1, -(-95 * values.numel() // 100))
+    """Return the figures of a map (H, W), float32, in bands: it may be larger than memory."""
+    width = jnd.shape[-1]
+    bands = jnd.split(max(1, BAND // width))
+    largest, place, total, visible, top = -1.0, 0, 0.0, 0, 0
+    for band in bands:
+        here = band.max().item()
+        if here > largest:
+            largest, place = here, top * width + int(band.argmax())
+        total += band.double().sum().item()
+        visible += int((band > VISIBLE).sum())
+        top += len(band)
+    y, x = divmod(place, width)
     return {
-        "max_jnd": values.max().item(),
+        "max_jnd": largest,
         "max_pixel": (x, y),
-        "mean_jnd": values.mean().item(),
-        "p95_jnd": values.kthvalue(rank).values.item(),
-        "visible_fraction": (values > VISIBLE).double().mean().item(),
+        "mean_jnd": total / jnd.numel(),
+        # The smallest value that at least 95 % of the pixels do not exceed.
+        "p95_jnd": _ranked(bands, max(1, -(-95 * jnd.numel() // 100))),
+        "visible_fraction": visible / jnd.numel(),
     }
+
+
+def _ranked(bands: Sequence[Tensor], rank: int) -> float:
+    """Return the value of a rank, from 1 on, of values of 0 or more in float32.
+
+    Such numbers are ordered as their bits are: the upper half of these is found first, then the
+    lower.
+    """
+    chosen, half = 0, 2**16
+    for step in range(2):
+        counts = torch.zeros(half, dtype=torch.int64)
+        for band in bands:
+            bits = band.float().contiguous().view(torch.int32).flatten()
+            some = bits // half if step == 0 else bits[bits // half == chosen] % half
+            counts += some.bincount(minlength=half).cpu()
+        reached = counts.cumsum(0)
+        place = int(torch.searchsorted(reached, rank))
+        rank -= int(reached[place] - counts[place])
+        chosen = chosen * half + place
+    return torch.tensor(chosen, dtype=torch.int32).view(torch.float32).item()
+
+
+def shrunk(source: Source) -> Tensor:
+    """Return an image (3, H, W) small enough for a picture of it: means of blocks of pixels."""
+    height, width = source.shape[-2:]
+    block = -(-height // LARGEST_PANEL), -(-width // LARGEST_PANEL)
+    rows = block[0] * max(1, BAND // (block[0] * width))
+    parts = [
+        functional.avg_pool2d(
+            read(source, 0, (slice(top, min(top + rows, height)), slice(0, width))).float(),
+            block,
+            ceil_mode=True,
+            count_include_pad=False,
+        )
+        for top in range(0, height, rows)
+    ]
+    return torch.cat(parts, -2)[0]
+
+
+def _shrunk_map(jnd: Tensor) -> Tensor:
+    """Return a map (H, W) small enough for a picture of it: maxima of blocks of pixels."""
+    height, width = jnd.shape
+    block = -(-height // LARGEST_PANEL), -(-width // LARGEST_PANEL)
+    bands = jnd.split(block[0] * max(1, BAND // (block[0] * width)))
+    parts = [
+        functional.max_pool2d(band[None, None].float(), block, ceil_mode=True) for band in bands
+    ]
+    return torch.cat(parts, -2)[0, 0]
 
 
 def table(comparison: Comparison, luminances: tuple[float, float]) -> "RenderableType":
@@ -135,15 +203,16 @@ def write_heat_map(path: Path, reference: Tensor, test: Tensor, jnd: Tensor, tit
     path
         The PNG file; it appears whole or not at all.
     reference, test
-        (3, H, W), sRGB-coded; values outside [0, 1] are clipped.
+        (3, h, w), sRGB-coded, as `shrunk` gives them; values outside [0, 1] are clipped.
     jnd
-        (H, W).
+        (H, W), of any size.
     title
         One line over the picture.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    jnd = _shrunk_map(jnd.detach())
     height, width = jnd.shape
     # Panels of 4 inches on their longer side; wide images stand above each other.
     rows, columns = (1, 3) if width <= 2 * height else (3, 1)
@@ -170,6 +239,8 @@ def write_heat_map(path: Path, reference: Tensor, test: Tensor, jnd: Tensor, tit
     for axis in axes:
         axis.set_xticks([])
         axis.set_yticks([])
+        if max(height, width) > LONGEST * min(height, width):
+            axis.set_aspect("auto")
     figure.suptitle(title, fontsize=10)
     with atomic_path(path) as temporary:
         figure.savefig(temporary)

@@ -6,6 +6,7 @@ chapter was not at hand: what is marked "recalled" is from memory, see docs/mode
 """
 
 import math
+from typing import NoReturn
 
 import torch
 from torch import Tensor
@@ -111,6 +112,15 @@ class Sarnoff(PairMetric):
     def extra_repr(self) -> str:
         """Return the options."""
         return f"ppd={self.ppd}, display={self.display}, resample={self.resample}"
+
+    def tiled(self, *_: object, **__: object) -> NoReturn:
+        """Refuse: see the message."""
+        raise ValueError(
+            "expected a VDM for an image in tiles, got Sarnoff's model, whose resampling to its "
+            "own grid has no exact tiles; crop the image, or use VDM().tiled"
+        )
+
+    tiled_score = tiled
 
     def _sensitivities(self) -> list[float]:
         """Return the weight of every band, the finest first.

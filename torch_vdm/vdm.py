@@ -1,6 +1,7 @@
 """The visual difference metric: the stages of Fig. 2, in order. Only this file knows the order."""
 
 import math
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, Self
 
 import torch
@@ -16,6 +17,7 @@ from torch_vdm.contrast import (
     weber_contrast,
 )
 from torch_vdm.cortex import DEEPEST, Cortex, Haar, Transform
+from torch_vdm.cortex.transform import mean_of
 from torch_vdm.csf import bandpass, barten, butterworth
 from torch_vdm.display import BT709_TO_XYZ, Display
 from torch_vdm.distance import (
@@ -27,15 +29,25 @@ from torch_vdm.distance import (
 from torch_vdm.effects import Effects
 from torch_vdm.fast import SMALLEST, compiled
 from torch_vdm.masking import energy_transducer, signed_transducer
-from torch_vdm.matrix import mix
+from torch_vdm.matrix import mix, product
 from torch_vdm.observer import Observer
-from torch_vdm.pair import Nonfinite, PairMetric
+from torch_vdm.pair import Nonfinite
 from torch_vdm.pooling import glance, phase_energy, pool, pool_halves, surround, surround_halves
 from torch_vdm.quadtree import push
 from torch_vdm.sarnoff import Sarnoff
+from torch_vdm.tiled import TiledMetric, cut
+from torch_vdm.tiling import Tiling
 
 # Planes with more numbers are computed in parts. Status: choice, measured.
-LARGEST_AT_ONCE = 2**20
+LARGEST_AT_ONCE = 2**18
+
+# Pixels of a band of a large image, and how many levels, from the finest, are computed in bands.
+# Status: choice, measured.
+BAND, BAND_LEVELS = 2**19, 2
+
+# Levels of at most as many nodes are computed at once: there an operation costs more than the
+# numbers that it works on. Status: choice, measured.
+FEW_NODES = 64 * 64
 
 
 # A Butterworth filter's parameters.
@@ -45,21 +57,46 @@ FILTER = ("gain", "cutoff", "order")
 class Level(NamedTuple):
     """What a level of the transform responds to, as far as it does not depend on the image.
 
-    Where there are as many as orientations, one stands for all where all have the same.
+    For planes (h, w) of one level the last two sides are 1 and 1; for the nodes of several levels
+    in a row, they are 1 and as many. Where there are as many as orientations, one stands for all
+    where all have the same.
     """
 
     passed: Tensor
-    """(3,): the share of each cone's details that chromatic aberration leaves."""
+    """(3, 1, 1): the share of each cone's details that chromatic aberration leaves."""
     frequency: Tensor
-    """As many, in cycles/degree: the frequency of the best response."""
+    """(as many, 1, 1), in cycles/degree: the frequency of the best response."""
     gain: Tensor
-    """As many: what contrast is divided by."""
+    """(as many, 1, 1): what contrast is divided by."""
     sensitivity: Tensor
-    """(channels, as many): the contrast sensitivity, over the gain. Where the luminance is local,
-    that of C1 and C2 in bright light."""
+    """(channels, as many, 1, 1): the contrast sensitivity, over the gain. Where the luminance is
+    local, that of C1 and C2 in bright light."""
 
 
-class VDM(PairMetric):
+class Sight(NamedTuple):
+    """What turns the details of an image at a level into contrasts and weights them."""
+
+    scale: Tensor
+    """(B, 3, h, w): for each cone the share that chromatic aberration leaves, over what the
+    parent is adapted to."""
+    sensitivity: Tensor
+    """(B, channels, orientations, h, w): the contrast sensitivity of each channel, or one
+    orientation or node of it where all have the same."""
+
+    def pushed(self, size: tuple[int, int]) -> "Sight":
+        """Return what is given at the parents at their children, on a plane of ``size``."""
+        shared = self.sensitivity.shape[-2:] == (1, 1)
+        sensitivity = self.sensitivity if shared else push(self.sensitivity, size)
+        return Sight(push(self.scale, size), sensitivity)
+
+    def of(self, orientations: slice) -> "Sight":
+        """Return the sight of some orientations."""
+        if self.sensitivity.shape[2] == 1:
+            return self
+        return Sight(self.scale, self.sensitivity[:, :, orientations])
+
+
+class VDM(TiledMetric):
     """The visual difference metric of Bolin and Meyer 1999 as a module.
 
     Calling it with a test and a reference image, both (B, 3, H, W), gives the map of their
@@ -152,7 +189,50 @@ class VDM(PairMetric):
         )
 
     def _accumulated(self, test: Tensor, reference: Tensor) -> Tensor:
+        # Gradients need all that bands drop.
+        graph = torch.is_grad_enabled() and (test.requires_grad or reference.requires_grad)
+        if not (graph or torch.compiler.is_compiling()) and (
+            isinstance(self.transform, Haar) and math.prod(_size(test)) >= 2 * BAND
+        ):
+            return self._accumulated_in_bands(test, reference, self.transform)
         return self.compare(self.represent(test), self.represent(reference))
+
+    def _accumulated_in_bands(self, test: Tensor, reference: Tensor, haar: Haar) -> Tensor:
+        """Return the same of large images, the finest levels band by band.
+
+        A band stays in the processor's cache, and its memory is used again for the next one, where
+        whole planes would be asked from the system anew in every call.
+        """
+        size, octaves = _size(test), BAND_LEVELS
+        options = self._fast, self.observer.true_means
+        constants = self._constants(test.dtype)
+        # For each level, coarser first, what its nodes have in each band.
+        fine: list[list[Tensor]] = [[] for _ in range(octaves)]
+        # For each image, the means of nodes of 2^octaves pixels, and those of rows.
+        means: tuple[list[Tensor], list[Tensor]] = [], []
+        means_of_rows: tuple[list[Tensor], list[Tensor]] = [], []
+        for band in Tiling.bands(size, BAND, octaves, haar.reach + 1):
+            bands: list[Cortex] = []
+            for number, image in enumerate((test, reference)):
+                cones = self._cone_planes(cut(image, band.around))
+                # One level more, for the parents of the last.
+                cortex = haar.begin(cones, octaves + 1, *options)
+                means[number].append(cut(cortex.lowpass[1], band.within(2**octaves)))
+                means_of_rows[number].append(cut(cones, band.within(1)).mean(-1, keepdim=True))
+                bands.append(cortex)
+            for number, level in enumerate(self._levels(bands[0], constants)):
+                if number > 0:
+                    local = self._local_difference(bands[0], bands[1], number, level, constants)
+                    node = 2 ** (octaves + 1 - number)
+                    fine[number - 1].append(cut(local, band.within(node)))
+        first, second = (
+            haar.coarser(
+                torch.cat(parts, -2), octaves, size, mean_of(torch.cat(rows, -2)), *options
+            )
+            for parts, rows in zip(means, means_of_rows, strict=True)
+        )
+        coarse, root = self._differences(first, second)
+        return accumulate([*coarse, *(torch.cat(planes, -2) for planes in fine)], root)
 
     def _to_pixels(self, plane: Tensor, size: tuple[int, int]) -> Tensor:
         # The leaves of overlapping nodes are the pixels.
@@ -166,22 +246,35 @@ class VDM(PairMetric):
         cycles, where the map stays local.
         """
         test, reference, _ = self._checked(test, reference)
-        constants = self._constants(test.dtype, "score_exponent", "score_coefficients")
-        exponent, coefficients = constants["score_exponent"], constants["score_coefficients"]
-        totals = []
-        for one, other in self._parts(test, reference):
-            first, second = self.represent(one), self.represent(other)
-            root = coefficients * self.lowpass_difference(first, second) ** exponent
-            glances = [
-                glance(
-                    self._scored(seen - expected, exponent),
-                    self.observer.score_window,
-                    self.transform.shifts,
-                )
-                for seen, expected in zip(self.respond(first), self.respond(second), strict=True)
-            ]
-            totals.append(accumulate(glances, root.sum(1, keepdim=True)).amax((1, 2, 3)))
-        return just_noticeable(torch.cat(totals) / coefficients, exponent)
+        totals = [
+            accumulate(*self._glances(self.represent(one), self.represent(other))).amax((1, 2, 3))
+            for one, other in self._parts(test, reference)
+        ]
+        return self._detected(torch.cat(totals))
+
+    def _detected(self, most: Tensor) -> Tensor:
+        """Return the score of what the largest leaf of each item has accumulated, (B,)."""
+        constants = self._constants(most.dtype, "score_exponent", "score_coefficients")
+        return just_noticeable(most / constants["score_coefficients"], constants["score_exponent"])
+
+    def _glances(self, first: Cortex, second: Cortex) -> tuple[list[Tensor], Tensor]:
+        """Return what one glance at each node adds to the score, and what every path begins with.
+
+        One (B, 1, h, w) a level, level 0 first, and (B, 1, 1, 1).
+        """
+        dtype = first.lowpass[0].dtype
+        constants = self._constants(dtype, "score_exponent", "score_coefficients")
+        exponent = constants["score_exponent"]
+        root = self.lowpass_difference(first, second) ** exponent
+        glances = [
+            glance(
+                self._scored(seen - expected, exponent),
+                self.observer.score_window,
+                self.transform.shifts,
+            )
+            for seen, expected in zip(self.respond(first), self.respond(second), strict=True)
+        ]
+        return glances, constants["score_coefficients"] * root.sum(1, keepdim=True)
 
     def _scored(self, difference: Tensor, exponent: Tensor) -> Tensor:
         """Return what each node of a level adds to the sum of the score, (B, 1, h, w)."""
@@ -202,14 +295,18 @@ class VDM(PairMetric):
 
         ``image`` is (B, 3, H, W) in float32 or float64, as the display expects it.
         """
+        planes = self._cone_planes(image)
+        return self.transform.decompose(planes, self._fast, self.observer.true_means)
+
+    def _cone_planes(self, image: Tensor) -> Tensor:
+        """Return the cone responses (B, 3, H, W) to an image: display, cones."""
         constants = self._constants(image.dtype, "primaries", "cones")
         around = self.display, constants["primaries"], constants["cones"]
         if self._fast:
             planes: Tensor = compiled(_light)(image, *around)
-        else:
-            rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
-            planes = torch.cat([_light(part, *around) for part in image.split(rows, -2)], -2)
-        return self.transform.decompose(planes, self._fast, self.observer.true_means)
+            return planes
+        rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
+        return torch.cat([self._kept(_light, part, *around) for part in image.split(rows, -2)], -2)
 
     def respond(self, cortex: Cortex) -> tuple[Tensor, ...]:
         """Return the responses of one image: chromatic aberration to the transducer.
@@ -217,20 +314,14 @@ class VDM(PairMetric):
         One (B, channels, orientations, h, w) a level, level 0 first; 1 is threshold.
         """
         constants = self._constants(cortex.lowpass[0].dtype)
-        return tuple(
-            _response(
-                detail,
-                *self._sight(cortex, number, level, constants),
-                constants["opponents"],
-                constants["transducer_exponent"],
-                self.observer.signed,
-                self.effects.masking,
-                self.transform.phases,
+        responses = []
+        for number, level in enumerate(self._levels(cortex, constants)):
+            detail = cortex.details[number]
+            (sight,) = self._sights(level, constants, [cortex.parent_lowpass(number)])
+            responses.append(
+                _response(detail, sight.pushed(_size(detail)), *self._options(constants))
             )
-            for number, (detail, level) in enumerate(
-                zip(cortex.details, self._levels(cortex, constants), strict=True)
-            )
-        )
+        return tuple(responses)
 
     def lowpass_difference(self, first: Cortex, second: Cortex) -> Tensor:
         """Return the weighted contrast between the means of two images, the lowpass term.
@@ -252,10 +343,13 @@ class VDM(PairMetric):
         (B, 1, h, w) of the finest level. The responses of a level are taken and dropped one
         level at a time, which bounds memory.
         """
+        return accumulate(*self._differences(first, second))
+
+    def _differences(self, first: Cortex, second: Cortex) -> tuple[tuple[Tensor, ...], Tensor]:
+        """Return what each node adds to the map, and what every path begins with."""
         constants = self._constants(first.lowpass[0].dtype, "summation_exponent")
         root = self.lowpass_difference(first, second) ** constants["summation_exponent"]
-        local = self.local_differences(first, second)
-        return accumulate(local, root.sum(1, keepdim=True))
+        return self.local_differences(first, second), root.sum(1, keepdim=True)
 
     def local_differences(self, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
         """Return the local visual difference of every node (Eq. 5), before the root.
@@ -263,10 +357,38 @@ class VDM(PairMetric):
         One (B, 1, h, w) a level, level 0 first.
         """
         constants = self._constants(first.lowpass[0].dtype)
-        return tuple(
-            self._local_difference(first, second, number, level, constants)
-            for number, level in enumerate(self._levels(first, constants))
+        levels = self._levels(first, constants)
+        few = sum(math.prod(_size(detail)) <= FEW_NODES for detail in first.details)
+        return (
+            *self._local_differences_of_few(first, second, levels[:few], constants),
+            *(
+                self._local_difference(first, second, number, levels[number], constants)
+                for number in range(few, len(levels))
+            ),
         )
+
+    def _local_differences_of_few(
+        self, first: Cortex, second: Cortex, levels: list[Level], constants: dict[str, Tensor]
+    ) -> list[Tensor]:
+        """Return the local visual differences of the coarsest levels, their nodes in a row."""
+        if not levels:
+            return []
+        sizes = [_size(detail) for detail in first.details[: len(levels)]]
+        nodes = [math.prod(size) for size in sizes]
+        details, parents = [], []
+        for cortex in (first, second):
+            details.append(_in_a_row(cortex.details[: len(levels)]))
+            lowpass = (cortex.parent_lowpass(number) for number in range(len(levels)))
+            pushed = [push(plane, size) for plane, size in zip(lowpass, sizes, strict=True)]
+            parents.append(_in_a_row(pushed))
+        sights = self._sights(_levels_in_a_row(levels, nodes), constants, parents)
+        difference = _response_difference(
+            details[0], details[1], sights[0], sights[1], *self._options(constants)
+        )
+        return [
+            self._gathered(part.unflatten(-1, size).squeeze(-3), constants["summation_exponent"])
+            for part, size in zip(difference.split(nodes, -1), sizes, strict=True)
+        ]
 
     def _local_difference(
         self,
@@ -277,36 +399,48 @@ class VDM(PairMetric):
         constants: dict[str, Tensor],
     ) -> Tensor:
         """Return the local visual difference (B, 1, h, w) of one level."""
-        one, other = first.details[number], second.details[number]
-        scale, sensitivity = self._sight(first, number, level, constants)
-        other_scale, other_sensitivity = self._sight(second, number, level, constants)
-        phases = self.transform.phases
-        fast = self._fast and one.numel() >= SMALLEST
+        details, others = first.details[number], second.details[number]
+        parents = [cortex.parent_lowpass(number) for cortex in (first, second)]
+        fast = self._fast and details.numel() >= SMALLEST
+        sight, other_sight = (
+            sight.pushed(_size(details)) for sight in self._sights(level, constants, parents, fast)
+        )
+        orientations = details.shape[2]
         respond = compiled(_response_difference) if fast else _response_difference
         # One orientation at a time where the planes are large: what is computed on the way then
         # stays in the processor's cache. Compiled code keeps nothing on the way.
-        at_once = one.shape[2] if fast or one.numel() <= LARGEST_AT_ONCE else phases
+        at_once = orientations
+        if not fast and details.numel() > LARGEST_AT_ONCE:
+            at_once = self.transform.phases
         local = []
-        for plane in range(0, one.shape[2], at_once):
+        for plane in range(0, orientations, at_once):
             some = slice(plane, plane + at_once)
-            same = some if sensitivity.shape[2] > 1 else slice(None)
-            difference = respond(
-                one[:, :, some],
-                other[:, :, some],
-                scale,
-                sensitivity[:, :, same],
-                other_scale,
-                other_sensitivity[:, :, same],
-                constants["opponents"],
-                constants["transducer_exponent"],
-                self.observer.signed,
-                self.effects.masking,
-                phases,
+            arguments = (
+                details[:, :, some],
+                others[:, :, some],
+                sight.of(some),
+                other_sight.of(some),
+                *self._options(constants),
             )
-            local.append(self._gathered(difference, constants["summation_exponent"], fast))
+
+            def gathered(*arguments: Any) -> Tensor:
+                difference = respond(*arguments)
+                return self._gathered(difference, constants["summation_exponent"], fast)
+
+            local.append(self._kept(gathered, *arguments))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]
 
-    def _gathered(self, difference: Tensor, exponent: Tensor, fast: bool) -> Tensor:
+    def _options(self, constants: dict[str, Tensor]) -> tuple[Tensor, Tensor, bool, bool, int]:
+        """Return what `_response` takes beside details and sight."""
+        return (
+            constants["opponents"],
+            constants["transducer_exponent"],
+            self.observer.signed,
+            self.effects.masking,
+            self.transform.phases,
+        )
+
+    def _gathered(self, difference: Tensor, exponent: Tensor, fast: bool = False) -> Tensor:
         """Return the local visual difference of response differences, after spatial pooling."""
         if self.transform.shifts == 1:
             if not self.effects.pooling:
@@ -322,25 +456,17 @@ class VDM(PairMetric):
         local = columns(rows(surrounded, nodes, -1), nodes, exponent)
         return local  # noqa: RET504  # for its type
 
-    def _sight(
-        self, cortex: Cortex, number: int, level: Level, constants: dict[str, Tensor]
-    ) -> tuple[Tensor, Tensor]:
-        """Return what turns a level's details into contrasts and weights them.
-
-        For each cone (B, 3, h, w): the share that chromatic aberration leaves, over the parent's
-        adaptation; scaled at the parents, of which there are fewer. For each channel the contrast
-        sensitivity, (B, channels, orientations, h, w), or one orientation or node of it where all
-        have the same.
-        """
-        parent = cortex.parent_lowpass(number)
-        size = (cortex.details[number].shape[-2], cortex.details[number].shape[-1])
-        fast = self._fast and parent.numel() >= SMALLEST
-        scaled = compiled(_scale) if fast else _scale
-        scale = push(scaled(parent, level.passed, constants["dark_cones"]), size)
-        if self.observer.adaptation_luminance is not None:
-            return scale, level.sensitivity[None, ..., None, None]
-        sensed = compiled(_sensitivity) if fast else _sensitivity
-        return scale, push(sensed(parent, level, constants, self.effects.chromatic), size)
+    def _sights(
+        self,
+        level: Level,
+        constants: dict[str, Tensor],
+        parents: Sequence[Tensor],
+        fast: bool = False,
+    ) -> list[Sight]:
+        """Return the sight of a level for each image, at the parents, whose lowpass is given."""
+        look = compiled(_sight) if fast else _sight
+        local = self.observer.adaptation_luminance is None
+        return [look(parent, level, constants, local, self.effects.chromatic) for parent in parents]
 
     def _levels(self, cortex: Cortex, constants: dict[str, Tensor]) -> list[Level]:
         """Return what each level of ``cortex`` responds to, level 0 (the coarsest) first.
@@ -350,7 +476,8 @@ class VDM(PairMetric):
         count = len(cortex.details)
         if count == 0:
             return []
-        frequency, gain = (constants[name][:count].flip(0) for name in ("frequencies", "gains"))
+        some = slice(cortex.finest, cortex.finest + count)
+        frequency, gain = (constants[name][some].flip(0) for name in ("frequencies", "gains"))
         if self.effects.aberration:
             passed = attenuation(
                 frequency[:, 0], constants["aberration_cutoff"], constants["aberration_exponent"]
@@ -368,19 +495,44 @@ class VDM(PairMetric):
             ]
         bright = torch.stack(channels, 1) / gain.unsqueeze(1) if channels else gain.unsqueeze(1)
         # Copies, for compiled code is specialised on the offset of a view.
-        columns = [[row.clone() for row in part] for part in (passed, frequency, gain, bright)]
+        columns = (
+            [row[..., None, None].clone() for row in part]
+            for part in (passed, frequency, gain, bright)
+        )
         return [Level(*row) for row in zip(*columns, strict=True)]
+
+
+def _size(plane: Tensor) -> tuple[int, int]:
+    return plane.shape[-2], plane.shape[-1]
+
+
+def _in_a_row(planes: Iterable[Tensor]) -> Tensor:
+    """Return the nodes of planes (..., h, w) in a row, (..., 1, all of them)."""
+    return torch.cat([plane.flatten(-2) for plane in planes], -1).unsqueeze(-2)
+
+
+def _levels_in_a_row(levels: Sequence[Level], nodes: Sequence[int]) -> Level:
+    """Return several levels as one, whose planes are the ``nodes`` of each in a row."""
+    device = levels[0].passed.device
+    count = torch.tensor(nodes, device=device)
+    # For each node its level; the size is given so that nothing is read back from the device.
+    which = torch.repeat_interleave(
+        torch.arange(len(nodes), device=device), count, output_size=sum(nodes)
+    )
+    return Level(*(torch.cat(part, -1)[..., which] for part in zip(*levels, strict=True)))
 
 
 def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) -> Tensor:
     """Return the cone responses (B, 3, H, W) to an image on a display."""
-    return cone_responses(display.to_xyz(image, primaries), cones)
+    if display.encoding == "xyz":
+        return cone_responses(display.to_xyz(image, primaries), cones)
+    # From the display's primaries to cones at once: one mixing of all pixels instead of two.
+    return display.to_xyz(image, product(cones, primaries))
 
 
 def _response(
     details: Tensor,
-    scale: Tensor,
-    sensitivity: Tensor,
+    sight: Sight,
     matrix: Tensor,
     exponent: Tensor,
     signed: bool,
@@ -388,8 +540,8 @@ def _response(
     phases: int,
 ) -> Tensor:
     """Return the responses of one level of one image: local contrast to the transducer."""
-    contrast = opponents(local_contrast(details, scale), matrix)
-    weighted = contrast * sensitivity
+    contrast = opponents(local_contrast(details, sight.scale), matrix)
+    weighted = contrast * sight.sensitivity
     if signed:
         return signed_transducer(weighted, exponent, phases) if masking else weighted
     return energy_transducer(weighted * weighted) if masking else weighted.abs()
@@ -398,10 +550,8 @@ def _response(
 def _response_difference(
     details: Tensor,
     other_details: Tensor,
-    scale: Tensor,
-    sensitivity: Tensor,
-    other_scale: Tensor,
-    other_sensitivity: Tensor,
+    sight: Sight,
+    other_sight: Sight,
     matrix: Tensor,
     exponent: Tensor,
     signed: bool,
@@ -413,16 +563,24 @@ def _response_difference(
     Each image by itself: equal images then take equal paths through the vectorised loops, and
     their difference is exactly 0.
     """
-    response = _response(details, scale, sensitivity, matrix, exponent, signed, masking, phases)
-    other = _response(
-        other_details, other_scale, other_sensitivity, matrix, exponent, signed, masking, phases
+    options = matrix, exponent, signed, masking, phases
+    difference = _response(details, sight, *options) - _response(
+        other_details, other_sight, *options
     )
-    return (response - other).abs() if signed else response - other
+    return difference.abs() if signed else difference
 
 
-def _scale(parent: Tensor, passed: Tensor, dark_cones: Tensor) -> Tensor:
-    """Return what turns details into contrasts, at their parents."""
-    return passed.view(3, 1, 1) / adapted(parent, dark_cones)
+def _sight(
+    parent: Tensor, level: Level, constants: dict[str, Tensor], local: bool, chromatic: bool
+) -> Sight:
+    """Return the sight of a level at its parents, of which there are fewer than nodes.
+
+    ``parent`` is their lowpass (B, 3, h, w); ``local``: in the local luminance.
+    """
+    scale = level.passed / adapted(parent, constants["dark_cones"])
+    if not local:
+        return Sight(scale, level.sensitivity.unsqueeze(0))
+    return Sight(scale, _sensitivity(parent, level, constants, chromatic))
 
 
 def _sensitivity(
@@ -434,16 +592,16 @@ def _sensitivity(
     dark = torch.log2(1.0 + constants["dim_luminance"] / luminance)
     glare = torch.log2(1.0 + luminance / constants["glare_luminance"])
     faint = torch.log2(1.0 + constants["peak_luminance"] / luminance)
-    relative = torch.log2(level.frequency / constants["peak_frequency"]).view(-1, 1, 1)
+    relative = torch.log2(level.frequency / constants["peak_frequency"])
     octaves = relative + constants["peak_exponent"] * faint
     dimmed = constants["achromatic_dimming"] * dark + constants["glare_exponent"] * glare
     shape = bandpass(octaves, constants["band_width"], constants["band_floor"])
-    gain = constants["achromatic_gain"] / level.gain.view(-1, 1, 1)
+    gain = constants["achromatic_gain"] / level.gain
     achromatic = gain * shape * torch.exp2(-dimmed)
     if not chromatic:
         return achromatic
     dim = torch.exp2(-constants["chromatic_dimming"] * dark)
-    return torch.cat((achromatic, level.sensitivity[..., None, None] * dim), 1)
+    return torch.cat((achromatic, level.sensitivity * dim), 1)
 
 
 def _pooled_energy(surrounded: Tensor, nodes: int, exponent: Tensor) -> Tensor:

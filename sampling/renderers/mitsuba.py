@@ -31,8 +31,8 @@ VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 BATCH = 2**20
 
 # What is asked of the `aov` integrator, in its own words, and how many numbers it gives.
-AOVS = "albedo:albedo,normal:sh_normal"
-AOV_NAMES = ("albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal.Z")
+AOVS = "albedo:albedo,normal:sh_normal,depth:depth"
+AOV_NAMES = ("albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal.Z", "depth.Z")
 
 
 class SceneError(ValueError):
@@ -51,7 +51,8 @@ class MitsubaRenderer:
     seed
         0 to 2^32 - 1; other seeds give independent images.
     aov
-        Whether albedo and shading normal are averaged in the same pass.
+        Whether albedo, shading normal and depth are averaged in the same pass; depth is the length
+        of the ray, in the scene's units, and 0 where it hits nothing.
     variant
         One of `VARIANTS`, or "auto": a GPU where there is one, else compiled code where there is an
         LLVM, else the interpreted variant, with a warning.
@@ -67,8 +68,8 @@ class MitsubaRenderer:
     fingerprint
         A hash of the scene's file, of every file that it names, and of the parameters.
     aov_sums
-        (7, H W), float64: sums of albedo R, G, B and normal X, Y, Z, and how many samples they
-        are of; None without ``aov``. A continued run begins with those of the run before.
+        (8, H W), float64: sums of albedo R, G, B, normal X, Y, Z and depth, and how many samples
+        they are of; None without ``aov``. A continued run begins with those of the run before.
 
     Raises
     ------
@@ -281,7 +282,7 @@ class MitsubaRenderer:
         return integrator
 
     def aovs(self) -> dict[str, NDArray[np.float64]]:
-        """Return the mean albedo and shading normal so far, (H, W) each, by name of channel."""
+        """Return the means of `AOV_NAMES` so far, (H, W) each, by name of channel."""
         if self.aov_sums is None:
             return {}
         *sums, count = self.aov_sums

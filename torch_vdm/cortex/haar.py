@@ -7,7 +7,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torch_vdm.cortex.transform import Cortex
+from torch_vdm.cortex.transform import DEEPEST, Cortex, mean_of
 from torch_vdm.fast import SMALLEST, compiled
 from torch_vdm.quadtree import complete, own, pad_even
 
@@ -18,6 +18,7 @@ class Haar:
 
     shifts = 1
     phases = 1
+    reach = 1
 
     def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:
         """Decompose (B, C, H, W) by Eq. 2 down to one node, by compiled steps if ``fast``.
@@ -31,20 +32,54 @@ class Haar:
             ``details[l]`` is (B, C, 3, h, w): d1 (horizontal), d2 (vertical), d3 (diagonal).
         """
         size = (planes.shape[-2], planes.shape[-1])
-        mean = planes.mean((-2, -1), keepdim=True)
-        details: list[Tensor] = []
-        lowpass: list[Tensor] = []
-        while max(planes.shape[-2:]) > 1:
-            step = compiled(_analyse) if fast and planes.numel() >= SMALLEST else _analyse
-            if true_means:
-                node = 2 ** len(details)
-                mean_of_all, detail = step(complete(planes, size, node))
-                planes = own(mean_of_all, planes, size, node)
-            else:
-                planes, detail = step(pad_even(planes))
-            details.append(detail)
-            lowpass.append(planes)
+        mean = mean_of(planes)
+        details, lowpass = levels(planes, 1, size, fast, true_means)
         return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [planes])), mean)
+
+    def begin(
+        self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
+    ) -> Cortex:
+        """Return the ``count`` finest levels of `decompose`, without a mean; arguments as there."""
+        size = (planes.shape[-2], planes.shape[-1])
+        details, lowpass = levels(planes, 1, size, fast, true_means, count)
+        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass)), planes[..., :1, :1])
+
+    def reduced(
+        self, planes: Tensor, octaves: int, fast: bool = False, true_means: bool = False
+    ) -> Tensor:
+        """Return the means of nodes of 2^octaves pixels; arguments as `decompose`."""
+        size = (planes.shape[-2], planes.shape[-1])
+        return [planes, *levels(planes, 1, size, fast, true_means, octaves)[1]][octaves]
+
+    def resume(
+        self,
+        plane: Tensor,
+        octaves: int,
+        size: tuple[int, int],
+        mean: Tensor,
+        fast: bool = False,
+        true_means: bool = False,
+    ) -> Cortex:
+        """Decompose what `reduced` gives; see `Transform.resume`."""
+        # The first step is a level that tiles have.
+        _, (plane,) = levels(plane, 2**octaves, size, fast, true_means, 1)
+        return self.coarser(plane, octaves + 1, size, mean, fast, true_means)
+
+    def coarser(
+        self,
+        plane: Tensor,
+        octaves: int,
+        size: tuple[int, int],
+        mean: Tensor,
+        fast: bool = False,
+        true_means: bool = False,
+    ) -> Cortex:
+        """Return the levels of `decompose` without its ``octaves`` finest.
+
+        ``plane`` has the means of nodes of 2^octaves pixels; other arguments as in `resume`.
+        """
+        details, lowpass = levels(plane, 2**octaves, size, fast, true_means)
+        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass)), mean, octaves)
 
     def peak(self, level_from_finest: int) -> tuple[float, float]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there."""
@@ -53,6 +88,34 @@ class Haar:
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
         """Return the same, for all three orientations."""
         return (_peak(level_from_finest),)
+
+
+def levels(
+    planes: Tensor,
+    node: int,
+    size: tuple[int, int],
+    fast: bool,
+    true_means: bool,
+    count: int = DEEPEST,
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Return details and lowpass of the ``count`` finest levels, the finest first.
+
+    ``planes`` (B, C, h, w) are the means of nodes of ``node`` x ``node`` pixels of an image of
+    ``size`` = (H, W) pixels.
+    """
+    details: list[Tensor] = []
+    lowpass: list[Tensor] = []
+    while max(planes.shape[-2:]) > 1 and len(details) < count:
+        step = compiled(_analyse) if fast and planes.numel() >= SMALLEST else _analyse
+        if true_means:
+            mean_of_all, detail = step(complete(planes, size, node))
+            planes = own(mean_of_all, planes, size, node)
+        else:
+            planes, detail = step(pad_even(planes))
+        details.append(detail)
+        lowpass.append(planes)
+        node *= 2
+    return details, lowpass
 
 
 def _analyse(even: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.cortex.haar import Haar
-from torch_vdm.cortex.transform import Cortex
+from torch_vdm.cortex.haar import Haar, levels
+from torch_vdm.cortex.transform import Cortex, mean_of
 from torch_vdm.fast import SMALLEST, compiled
 from torch_vdm.quadtree import share
 
@@ -35,6 +35,7 @@ class StationaryHaar:
 
     shifts = 2
     phases = 1
+    reach = 5
 
     def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:
         """Decompose (B, C, H, W) to the coarsest level; arguments as `Haar.decompose`.
@@ -46,28 +47,59 @@ class StationaryHaar:
             size and each next one of half its sides, rounded up. The node (y, x) begins at the
             pixel (2^k y, 2^k x) of level k from the finest, or 2^(k - 1) after it.
         """
-        plain = Haar().decompose(planes, fast, true_means)
         size = (planes.shape[-2], planes.shape[-1])
-        # The means of nodes of 1, 2, 4 ... pixels.
-        means = [planes, *reversed(plain.lowpass)] if plain.details else [planes]
-        details: list[Tensor] = []
-        lowpass: list[Tensor] = []
-        for level in range(len(plain.details)):
-            # The halves or, from the second level on, the quarters of a node.
-            node = 2 ** max(level - 1, 0)
-            parts = means[max(level - 1, 0)]
-            if true_means:
-                parts = _faded(parts, size, node)
-            analyse = _halves if level == 0 else _quarters
-            use = compiled(analyse) if fast and parts.numel() >= SMALLEST else analyse
-            mean, detail = use(parts)
-            details.append(detail)
-            lowpass.append(mean)
-        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [planes])), plain.mean)
+        mean = mean_of(planes)
+        details, means = levels(planes, 1, size, fast, true_means)
+        # The means of nodes of 1, 1, 2, 4 ... pixels: halves of the finest, quarters of all others.
+        parts = [planes, planes, *means][: len(details)]
+        if not parts:
+            return Cortex((), (planes,), mean)
+        return _cortex(parts, 0, size, mean, fast, true_means)
+
+    def reduced(
+        self, planes: Tensor, octaves: int, fast: bool = False, true_means: bool = False
+    ) -> Tensor:
+        """Return the means of nodes of 2^octaves pixels; arguments as `decompose`."""
+        return Haar().reduced(planes, octaves, fast, true_means)
+
+    def resume(
+        self,
+        plane: Tensor,
+        octaves: int,
+        size: tuple[int, int],
+        mean: Tensor,
+        fast: bool = False,
+        true_means: bool = False,
+    ) -> Cortex:
+        """Decompose what `reduced` gives; see `Transform.resume`."""
+        details, means = levels(plane, 2**octaves, size, fast, true_means)
+        parts = [plane, *means][: len(details) - 1]
+        return _cortex(parts, octaves + 1, size, mean, fast, true_means)
 
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
         """Return the best frequency, cycles/pixel, and its gain for d1, d2 and d3."""
         return _peaks(level_from_finest)
+
+
+def _cortex(
+    parts: list[Tensor],
+    finest: int,
+    size: tuple[int, int],
+    mean: Tensor,
+    fast: bool,
+    true_means: bool,
+) -> Cortex:
+    """Return the levels from ``finest`` on, of the means that are the parts of their nodes."""
+    details: list[Tensor] = []
+    lowpass: list[Tensor] = []
+    for level, part in enumerate(parts, finest):
+        faded = _faded(part, size, 2 ** max(level - 1, 0)) if true_means else part
+        analyse = _halves if level == 0 else _quarters
+        use = compiled(analyse) if fast and part.numel() >= SMALLEST else analyse
+        lowest, detail = use(faded)
+        details.append(detail)
+        lowpass.append(lowest)
+    return Cortex(tuple(reversed(details)), tuple(reversed(lowpass)), mean, finest)
 
 
 def _faded(parts: Tensor, size: tuple[int, int], node: int) -> Tensor:

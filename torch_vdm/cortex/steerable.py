@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from torch_vdm.cortex import oriented
 from torch_vdm.cortex.gaussian import blur, lowpass_response, step
-from torch_vdm.cortex.transform import DEEPEST, Cortex
+from torch_vdm.cortex.transform import DEEPEST, Cortex, mean_of
 from torch_vdm.fast import SMALLEST
 
 # The image half-way between its pixels, which the finest level needs: a sinc of so many taps on
@@ -57,6 +57,7 @@ class Steerable:
 
     shifts = 2
     phases = 2
+    reach = 12
 
     _peaks: tuple[Peak, ...] = field(init=False, repr=False, compare=False)
 
@@ -76,13 +77,40 @@ class Steerable:
             response, each 1 at a level's best frequency for a grating of amplitude 1. Sizes as of
             `StationaryHaar`.
         """
-        mean = planes.mean((-2, -1), keepdim=True)
+        mean = mean_of(planes)
+        band = _doubled(_doubled(planes, -1), -2)
+        return self._cortex(planes, band - blur(band, fast), 0, mean, fast)
+
+    def reduced(
+        self,
+        planes: Tensor,
+        octaves: int,
+        fast: bool = False,
+        true_means: bool = False,  # noqa: ARG002
+    ) -> Tensor:
+        """Return the Gaussian pyramid's plane; arguments as `decompose`."""
+        for _ in range(octaves):
+            planes = _dropped(blur(planes, fast))
+        return planes
+
+    def resume(
+        self,
+        plane: Tensor,
+        octaves: int,
+        size: tuple[int, int],  # noqa: ARG002
+        mean: Tensor,
+        fast: bool = False,
+        true_means: bool = False,  # noqa: ARG002
+    ) -> Cortex:
+        """Decompose what `reduced` gives; see `Transform.resume`."""
+        smooth = blur(plane, fast)
+        return self._cortex(_dropped(smooth), plane - smooth, octaves + 1, mean, fast)
+
+    def _cortex(self, plane: Tensor, band: Tensor, finest: int, mean: Tensor, fast: bool) -> Cortex:
+        """Return the levels from ``finest`` on, of its plane and the band that it is made of."""
         details: list[Tensor] = []
         lowpass: list[Tensor] = []
-        band = _doubled(_doubled(planes, -1), -2)
-        band = band - blur(band, fast)
-        plane = planes
-        for level in range((max(planes.shape[-2:]) - 1).bit_length()):
+        for level in range(finest, finest + (max(plane.shape[-2:]) - 1).bit_length()):
             size = (plane.shape[-2], plane.shape[-1])
             # The nodes lie between those of the next finer level: at the odd ones of the doubled
             # image, the even ones but the first of all others.
@@ -90,8 +118,8 @@ class Steerable:
             details.append(_responses(band, size, 1 if level == 0 else 2, peak, fast))
             smooth = blur(plane, fast)
             lowpass.append(_next(smooth))
-            band, plane = plane - smooth, smooth[..., ::2, ::2].contiguous()
-        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [planes])), mean)
+            band, plane = plane - smooth, _dropped(smooth)
+        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [plane])), mean, finest)
 
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there: 1."""
@@ -108,6 +136,11 @@ def _doubled(plane: Tensor, dim: int) -> Tensor:
         pair = padded.narrow(dim, HALFWAY - 1 - tap, length)
         between = between + weight * (pair + padded.narrow(dim, HALFWAY + tap, length))
     return torch.stack((plane, between), dim).flatten(dim - 1, dim)
+
+
+def _dropped(plane: Tensor) -> Tensor:
+    """Return every second sample of a plane."""
+    return plane[..., ::2, ::2].contiguous()
 
 
 def _next(plane: Tensor) -> Tensor:

@@ -21,11 +21,14 @@ class Cortex(NamedTuple):
     mean
         (B, cones, 1, 1), the mean of the image. Not the root's lowpass, in which the repeated
         border of an odd side may count for more than it is.
+    finest
+        How many levels finer than these the image has; see `Transform.resume`.
     """
 
     details: tuple[Tensor, ...]
     lowpass: tuple[Tensor, ...]
     mean: Tensor
+    finest: int = 0
 
     def parent_lowpass(self, level: int) -> Tensor:
         """Return the lowpass one level up from ``level``; the root's is its own."""
@@ -48,10 +51,38 @@ class Transform(Protocol):
     def phases(self) -> int:
         """How many successive planes of details are phases of one: 1, or 2 for even and odd."""
 
+    @property
+    def reach(self) -> int:
+        """How many nodes around a node, to each side, hold all that it and its parent are made of.
+
+        Nodes of its own level; what lies further off changes neither its details nor its parent's
+        lowpass.
+        """
+
     def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:
         """Decompose (B, C, H, W) to the coarsest level, by compiled steps if ``fast``.
 
         ``true_means``: no pixel counts for more than another, at the border of an odd side too.
+        """
+
+    def reduced(
+        self, planes: Tensor, octaves: int, fast: bool = False, true_means: bool = False
+    ) -> Tensor:
+        """Return (B, C, H, W) at 1 / 2^octaves of its sides, rounded up: what `resume` takes."""
+
+    def resume(
+        self,
+        plane: Tensor,
+        octaves: int,
+        size: tuple[int, int],
+        mean: Tensor,
+        fast: bool = False,
+        true_means: bool = False,
+    ) -> Cortex:
+        """Return the levels of `decompose` without its ``octaves`` + 1 finest.
+
+        From what `reduced` gives of an image of ``size`` = (H, W) and ``mean`` (B, C, 1, 1), so
+        that an image larger than memory is decomposed in tiles.
         """
 
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
@@ -59,3 +90,12 @@ class Transform(Protocol):
 
         For each orientation, or one for all of them.
         """
+
+
+def mean_of(planes: Tensor) -> Tensor:
+    """Return the mean of (B, C, H, W), (B, C, 1, 1), good to its last bit in any size.
+
+    The lowpass term takes the difference of two of them, 76 times and more: the rounding of a sum
+    over millions of pixels would be seen.
+    """
+    return planes.mean(-1, keepdim=True).double().mean(-2, keepdim=True).to(planes)

@@ -1,5 +1,6 @@
 """Images from files and to files: OpenEXR, PNG and JPEG."""
 
+from torch_vdm.io.arrays import ArrayFile
 from torch_vdm.io.files import (
     Image,
     atomic_path,
@@ -12,6 +13,7 @@ from torch_vdm.io.files import (
 from torch_vdm.io.refusal import ImageError
 
 __all__ = [
+    "ArrayFile",
     "Image",
     "ImageError",
     "atomic_path",

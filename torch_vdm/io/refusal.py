@@ -72,13 +72,18 @@ def require_finite(
     return np.where(bad, np.float32(0), planes)
 
 
-def without_negatives(planes: Floats, policy: str, notes: list[str]) -> Floats:
-    """Return ``planes`` with negative values kept, refused or replaced by 0."""
+def without_negatives(
+    planes: Floats, policy: str, notes: list[str], origin: tuple[int, int] = (0, 0)
+) -> Floats:
+    """Return ``planes`` with negative values kept, refused or replaced by 0.
+
+    Their first pixel is ``origin``, x and y, of the image.
+    """
     if policy == "keep" or planes.min() >= 0:
         return planes
     bad = planes < 0
     count = int(bad.sum())
-    x, y = first_pixel(bad)
+    x, y = (begin + place for begin, place in zip(origin, first_pixel(bad), strict=True))
     what = (
         f"{count} negative value{'s' * (count > 1)} (the first at x={x}, y={y}; the lowest is "
         f"{planes.min():.3g})"

@@ -1,0 +1,64 @@
+"""Large images, whose finest levels are computed in bands, against the same image whole."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from torch_vdm import VDM, Observer, vdm
+
+OBSERVERS = [Observer.calibrated(), Observer.paper()]
+
+# Bands that divide and that do not, odd sides, an image of one band.
+SIZES = [(160, 64), (161, 83), (299, 20), (70, 131), (5, 700)]
+
+
+@pytest.fixture(autouse=True)
+def thin_bands(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vdm, "BAND", 1024)
+
+
+def images(size: tuple[int, int], batch: int = 1) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(sum(size))
+    reference = torch.rand(batch, 3, *size, generator=generator, dtype=torch.float64)
+    noise = 0.05 * torch.randn(reference.shape, generator=generator, dtype=torch.float64)
+    return reference + noise, reference
+
+
+@pytest.mark.parametrize("observer", OBSERVERS, ids=lambda o: o.name)
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_bands_give_the_map_of_the_whole(
+    size: tuple[int, int], observer: Observer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    metric = VDM(observer=observer)
+    test, reference = images(size, batch=2)
+    banded = metric(test, reference)
+    monkeypatch.setattr(vdm, "BAND", 2**40)
+    torch.testing.assert_close(banded, metric(test, reference), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_equal_images_give_0_and_the_order_makes_no_difference(size: tuple[int, int]) -> None:
+    metric = VDM()
+    test, reference = (image.float() for image in images(size))
+    assert torch.count_nonzero(metric(reference, reference)) == 0
+    assert torch.equal(metric(test, reference), metric(reference, test))
+
+
+def test_gradients_are_those_of_the_whole_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    metric = VDM()
+    test, reference = images((160, 64))
+    test.requires_grad_()
+    (gradient,) = torch.autograd.grad(metric.power(test, reference).sum(), test)
+    monkeypatch.setattr(vdm, "BAND", 2**40)
+    (whole,) = torch.autograd.grad(metric.power(test, reference).sum(), test)
+    assert torch.equal(gradient, whole)
+    assert torch.count_nonzero(gradient) > 0
+
+
+def test_a_pixel_that_is_not_finite_is_masked_in_its_band() -> None:
+    test, reference = images((160, 64))
+    reference[0, 1, 100, 7] = torch.nan
+    jnd = VDM(nonfinite="mask")(test, reference)
+    assert bool(jnd.isfinite().all())
+    assert jnd[0, 0, 100, 7] == 0.0
+    assert torch.count_nonzero(jnd) == jnd.numel() - 1

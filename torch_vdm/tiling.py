@@ -1,0 +1,168 @@
+"""Images larger than memory: where their tiles lie, and how a part of one is read."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+# Pixels a side of a tile. Status: choice; 1024 takes half a gigabyte with `Haar`.
+TILE = 1024
+
+# The smallest tile: it holds two nodes of one level. Status: choice.
+SMALLEST_TILE = 4
+
+
+class Source(Protocol):
+    """An image, or a batch, that is read part by part: (3, H, W) or (B, 3, H, W).
+
+    A tensor, an array, a memory-mapped file (`numpy.load` with ``mmap_mode="r"``), an array of
+    h5py or zarr, or any object of one's own with these two. Floating point as `VDM` takes it, or
+    whole numbers of 8 or 16 bits, which stand for 0 to 1.
+    """
+
+    @property
+    def shape(self) -> Sequence[int]:
+        """(3, H, W) or (B, 3, H, W)."""
+
+    def __getitem__(self, index: Any, /) -> Any:
+        """Return the part that slices name, as a tensor or what NumPy takes for an array."""
+
+
+Slices = tuple[slice, slice]
+
+
+class Tile(NamedTuple):
+    """A part of an image, and the part with all that it is computed from."""
+
+    part: Slices
+    """Rows and columns of the image."""
+    around: Slices
+    """The same with its halo, as far as the image goes."""
+
+    def within(self, node: int) -> Slices:
+        """Return where the part lies on a plane of ``around`` with nodes of ``node`` pixels."""
+        return _scaled(self.part, node, (self.around[0].start, self.around[1].start))
+
+    def of_image(self, node: int) -> Slices:
+        """Return where the part lies on a plane of the image with nodes of ``node`` pixels."""
+        return _scaled(self.part, node, (0, 0))
+
+
+def _scaled(part: Slices, node: int, origin: tuple[int, int]) -> Slices:
+    rows, columns = (
+        slice((side.start - begin) // node, -(-(side.stop - begin) // node))
+        for side, begin in zip(part, origin, strict=True)
+    )
+    return rows, columns
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """How an image is cut.
+
+    Attributes
+    ----------
+    size
+        (H, W) of the image.
+    sides
+        Rows and columns of a tile.
+    levels
+        How many levels, from the finest, are computed in tiles; all others come from the whole
+        image's lowpass pyramid.
+    halo
+        Pixels that a tile is computed with beyond each of its sides.
+    """
+
+    size: tuple[int, int]
+    sides: tuple[int, int]
+    levels: int
+    halo: int
+
+    @classmethod
+    def fit(cls, size: tuple[int, int], tile: int, shifts: int, nodes: int) -> "Tiling":
+        """Return a tiling of an image of ``size`` with tiles of at most ``tile`` pixels a side.
+
+        The levels of tiles have ``shifts`` nodes in the width of one, and need ``nodes`` nodes
+        around each. There are as few as leave a plane no larger than a tile to the others: the halo
+        doubles with every level. Tiles and halos begin where the coarsest one's parents do, so that
+        the levels of a tile are a part of the image's.
+        """
+        if not (isinstance(tile, int) and tile >= SMALLEST_TILE):
+            raise ValueError(
+                f"expected a tile of {SMALLEST_TILE} or more pixels a side, got {tile}"
+            )
+        wanted = 1 + (-(-max(size) // tile) - 1).bit_length()
+        levels = min(wanted, tile.bit_length() - 2)
+        parent = 2 ** (levels + 1)
+        halo = -(-nodes // (2 * shifts)) * parent
+        side = tile // parent * parent
+        return cls(size, (side, side), levels, halo)
+
+    @classmethod
+    def bands(cls, size: tuple[int, int], pixels: int, levels: int, nodes: int) -> "Tiling":
+        """Return a tiling by bands as wide as the image, of about as many pixels.
+
+        For nodes that lie side by side; ``levels`` and ``nodes`` as in `fit`.
+        """
+        parent = 2 ** (levels + 1)
+        halo = -(-nodes // 2) * parent
+        # No thinner than so many halos, which are computed twice.
+        rows = max(pixels // (size[1] * parent) * parent, 4 * halo)
+        return cls(size, (rows, size[1]), levels, halo)
+
+    @property
+    def whole(self) -> bool:
+        """Whether the image is no larger than a tile."""
+        return all(side <= most for side, most in zip(self.size, self.sides, strict=True))
+
+    @property
+    def across(self) -> int:
+        """The number of tiles in a row."""
+        return -(-self.size[1] // self.sides[1])
+
+    def __len__(self) -> int:
+        """Return the number of tiles."""
+        return self.across * -(-self.size[0] // self.sides[0])
+
+    def __iter__(self) -> Iterator[Tile]:
+        """Yield the tiles, row by row."""
+        (height, width), (most_rows, most_columns) = self.size, self.sides
+        for top in range(0, height, most_rows):
+            rows = slice(top, min(top + most_rows, height))
+            for left in range(0, width, most_columns):
+                columns = slice(left, min(left + most_columns, width))
+                yield Tile(
+                    (rows, columns), (self._wider(rows, height), self._wider(columns, width))
+                )
+
+    def _wider(self, side: slice, length: int) -> slice:
+        return slice(max(side.start - self.halo, 0), min(side.stop + self.halo, length))
+
+
+def read(source: Source, item: int, part: Slices) -> Tensor:
+    """Return a part of an item of a source, (1, 3, h, w), of floating point."""
+    index = (slice(None), *part) if len(source.shape) == 3 else (item, slice(None), *part)
+    pixels = source[index]
+    # A copy: a memory-mapped file's pages need not stay, and it may not be written to.
+    image = pixels if isinstance(pixels, Tensor) else torch.from_numpy(np.array(pixels))
+    if image.dtype in (torch.uint8, torch.uint16):
+        image = image.to(torch.float32) / torch.iinfo(image.dtype).max
+    return image.unsqueeze(0)
+
+
+def check_sources(test: Source, reference: Source) -> tuple[int, tuple[int, int]]:
+    """Return the number of items and (H, W) of two sources of one shape; refuse others."""
+    shapes = [tuple(int(side) for side in source.shape) for source in (test, reference)]
+    for name, shape in zip(("test", "reference"), shapes, strict=True):
+        if len(shape) not in (3, 4) or shape[-3] != 3 or 0 in shape:
+            raise ValueError(
+                f"expected a {name} of shape (3, H, W) or (B, 3, H, W) with no side of 0, "
+                f"got {shape}"
+            )
+    if shapes[0] != shapes[1]:
+        raise ValueError(f"expected two images of one shape, got {shapes[0]} and {shapes[1]}")
+    height, width = shapes[0][-2:]
+    return (1 if len(shapes[0]) == 3 else shapes[0][0]), (height, width)
