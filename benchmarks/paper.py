@@ -133,8 +133,8 @@ def run(quick: bool, output: Path | None) -> None:
             (output / "paper_curves.json").write_text(json.dumps(_curves(found)) + "\n")
     if output is not None:
         paper_plots.draw(output, list(found.values()), STRATEGIES)
-        steps = refinement(next(one for one in found.values() if one.scene.name == REFINED))
-        paper_plots.refinement(output / "paper_refinement.png", steps)
+        if REFINED in found:
+            paper_plots.refinement(output / "paper_refinement.png", refinement(found[REFINED]))
     print(text)
 
 
