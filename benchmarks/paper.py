@@ -367,6 +367,7 @@ def _text(result: dict[str, Any]) -> str:
         for place, table in enumerate(figures["needed"]):
             ours = [middle(figures, s, "seconds", place) for s in STRATEGIES]
             uniform, objective, halfbuffer, perceptual = ours
+            # "-" where one of them did not get there.
             slowest = max(uniform, objective, perceptual)
             cells = [
                 f"{printed:.1f} | {_percent(value, slowest)}"
@@ -456,7 +457,7 @@ def _known(value: float | None) -> str:
 
 
 def _percent(value: float, slowest: float) -> str:
-    return "-" if math.isinf(value) else f"{100.0 * value / slowest:.1f}"
+    return "-" if math.isinf(slowest) else f"{100.0 * value / slowest:.1f}"
 
 
 def _mean(values: list[float]) -> float:
