@@ -133,13 +133,15 @@ def difference(metric: VDM, image: Plane, reference: Plane) -> Plane:
     return jnd
 
 
-def reference_of(scene: Scene, limits: Limits) -> Reference:
-    """Return the reference, rendered where it is not kept."""
+def reference_of(scene: Scene, limits: Limits, kept_only: bool = False) -> Reference | None:
+    """Return the reference, rendered where it is not kept; or None with ``kept_only``."""
     renderer = MitsubaRenderer(scene.path, {**scene.parameters, **scene.converging})
     named = [renderer.fingerprint, scene.passes, scene.ppd, limits]
     if not scene.passes:
         named.append(scene.tolerances)
     path = CACHE / f"reference-{_hash(named)}.npz"
+    if not path.exists() and kept_only:
+        return None
     if not path.exists():
         start = time.process_time()
         found = _by_passes(scene) if scene.passes else _adaptively(scene, limits)
@@ -178,12 +180,21 @@ def _adaptively(scene: Scene, limits: Limits) -> tuple[Plane, float]:
     return sampler.image, predicted
 
 
-def run_of(scene: Scene, strategy: str, seed: int, reference: Reference, limits: Limits) -> Run:
-    """Return a run, made where it is not kept."""
+def run_of(
+    scene: Scene,
+    strategy: str,
+    seed: int,
+    reference: Reference,
+    limits: Limits,
+    kept_only: bool = False,
+) -> Run | None:
+    """Return a run, made where it is not kept; or None with ``kept_only``."""
     renderer = MitsubaRenderer(scene.path, scene.parameters, seed=seed)
     described = dataclasses.asdict(scene) | {"path": renderer.fingerprint, "name": ""}
     named = [described, strategy, seed, limits, STEP, GROWTH, _source(), reference.error]
     path = CACHE / f"run-{_hash(named)}.npz"
+    if not path.exists() and kept_only:
+        return None
     if not path.exists():
         found = _run(scene, strategy, renderer, reference, limits)
         with atomic_path(path) as file, file.open("wb") as open_file:
