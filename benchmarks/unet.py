@@ -21,7 +21,7 @@ SLOPE = 0.1
 
 # Steps of Adam, its highest rate, crops a step, side of a crop in pixels. Status: choice: what
 # nine runs can take within two hours on two cores.
-STEPS, RATE, BATCH, CROP = 400, 2e-3, 6, 64
+STEPS, RATE, BATCH, CROP = 2000, 2e-3, 6, 64
 
 
 class UNet(nn.Module):
