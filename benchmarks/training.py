@@ -139,12 +139,13 @@ def trained(
     name: str, loss: Loss, pictures: Sequence[Picture], seed: int, steps: int, cache: Path
 ) -> unet.UNet:
     """Train a network, or read it from ``cache`` if this loss has trained it on this data."""
-    # What would make another network: the loss as it computes, the data, the settings.
+    # What would make another network: the loss as it computes, the data, the network's file with
+    # its settings.
     probe = torch.rand(2, 1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
     state = [
         f"{float(loss(*probe)):.5g}",
         [f"{float(each.noisy.double().sum() + each.reference.sum()):.6g}" for each in pictures],
-        (seed, steps, unet.RATE, unet.BATCH, unet.CROP, unet.WIDTHS),
+        (seed, steps, Path(unet.__file__).read_bytes()),
     ]
     key = hashlib.sha256(repr(state).encode()).hexdigest()[:16]
     kept = cache / f"{name}_{seed}_{key}.pt"

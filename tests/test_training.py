@@ -123,7 +123,7 @@ def test_training_repeats() -> None:
 
 def test_training_lowers_the_loss() -> None:
     images = pictures()
-    network = train(training.l1, images, 0, 60, 16, 4)
+    network = train(training.l1, images, 0, 120, 16, 4)
     noisy = torch.stack([each.noisy[0] for each in images])
     reference = encode_srgb(torch.stack([each.reference for each in images]))
     before = training.l1(encode_srgb(noisy[:, :3]), reference)
