@@ -15,7 +15,7 @@ BENCHMARKS = {
     "speed": "time and memory beside kornia's SSIM; 6 minutes, 1 with --quick",
     "stability": "hard images in every precision; 5 minutes, 1 with --quick",
     "stopping": "whether the sampler stops honestly; 30 minutes, 10 seconds with --quick",
-    "training": "a denoiser trained with each loss; 1 hour, 30 seconds with --quick",
+    "training": "a denoiser trained with each loss; 20 minutes, 30 seconds with --quick",
 }
 
 
