@@ -53,10 +53,9 @@ FEW_NODES = 64 * 64
 # sensitivities change by less than 3 dB from one to the next. Status: choice.
 LUMINANCES = tuple(range(-8, 18))
 
-# What a difference counts for in the detection score at most, so that its fourth power, summed,
-# stays finite in float32. Status: choice; light stays far below.
-LARGEST_SCORED = 1e8
-
+# A difference counts in the detection score for at most the largest number of its precision to this
+# power, so that its own fourth power, summed, stays finite: 5e7 in float32. Status: choice.
+LARGEST_SCORED = 0.2
 
 # A Butterworth filter's parameters.
 FILTER = ("gain", "cutoff", "order")
@@ -79,6 +78,31 @@ class Level(NamedTuple):
     sensitivity: Tensor
     """(channels, as many, 1, 1): the contrast sensitivity, over the gain. Where the luminance is
     local, that of C1 and C2 in bright light."""
+
+
+class Levels(NamedTuple):
+    """The same of all levels of an image, level 0 first, without the last two sides."""
+
+    passed: Tensor
+    """(levels, 3)."""
+    frequency: Tensor
+    """(levels, as many)."""
+    gain: Tensor
+    """(levels, as many)."""
+    sensitivity: Tensor
+    """(levels, channels, as many)."""
+
+    def only(self, number: int) -> Level:
+        """Return one level."""
+        # Copies, for compiled code is specialised on the offset of a view.
+        return Level(*(part[number, ..., None, None].clone() for part in self))
+
+    def in_a_row(self, nodes: Sequence[int]) -> Level:
+        """Return the coarsest levels as one, whose plane is the ``nodes`` of each in a row."""
+        # For each node its level; the size is given so that nothing is read back from the device.
+        counts = torch.tensor(nodes, device=self.passed.device)
+        which = torch.repeat_interleave(counts, output_size=sum(nodes))
+        return Level(*(part[which].movedim(0, -1).unsqueeze(-2) for part in self))
 
 
 class Sight(NamedTuple):
@@ -232,11 +256,12 @@ class VDM(TiledMetric):
                 means[number].append(cut(cortex.lowpass[1], strip.within(2**octaves)))
                 means_of_rows[number].append(cut(cones, strip.within(1)).mean(-1, keepdim=True))
                 strips.append(cortex)
-            for number, level in enumerate(self._levels(strips[0], constants)):
-                if number > 0:
-                    local = self._local_difference(strips[0], strips[1], number, level, constants)
-                    node = 2 ** (octaves + 1 - number)
-                    fine[number - 1].append(cut(local, strip.within(node)))
+            levels = self._levels(strips[0], constants)
+            for number in range(1, octaves + 1):
+                level = levels.only(number)
+                local = self._local_difference(strips[0], strips[1], number, level, constants)
+                node = 2 ** (octaves + 1 - number)
+                fine[number - 1].append(cut(local, strip.within(node)))
         first, second = (
             haar.coarser(
                 torch.cat(parts, -2), octaves, size, mean_of(torch.cat(rows, -2)), *options
@@ -277,11 +302,11 @@ class VDM(TiledMetric):
         dtype = first.lowpass[0].dtype
         constants = self._constants(dtype, "score_exponent", "score_coefficients")
         exponent = constants["score_exponent"]
-        lowpass = self.lowpass_difference(first, second).clamp_max(LARGEST_SCORED)
-        root = lowpass**exponent
+        most = torch.finfo(dtype).max ** LARGEST_SCORED
+        root = self.lowpass_difference(first, second).clamp_max(most) ** exponent
         glances = [
             glance(
-                self._scored((seen - expected).clamp(-LARGEST_SCORED, LARGEST_SCORED), exponent),
+                self._scored((seen - expected).clamp(-most, most), exponent),
                 self.observer.score_window,
                 self.transform.shifts,
             )
@@ -398,9 +423,10 @@ class VDM(TiledMetric):
         """
         constants = self._constants(cortex.lowpass[0].dtype)
         responses = []
-        for number, level in enumerate(self._levels(cortex, constants)):
-            detail = cortex.details[number]
-            (sight,) = self._sights(level, constants, [cortex.parent_lowpass(number)])
+        levels = self._levels(cortex, constants)
+        for number, detail in enumerate(cortex.details):
+            level, parent = levels.only(number), cortex.parent_lowpass(number)
+            (sight,) = self._sights(level, constants, [parent])
             responses.append(
                 _response(detail, sight.pushed(_size(detail)), *self._options(constants))
             )
@@ -443,35 +469,46 @@ class VDM(TiledMetric):
         levels = self._levels(first, constants)
         few = sum(math.prod(_size(detail)) <= FEW_NODES for detail in first.details)
         return (
-            *self._local_differences_of_few(first, second, levels[:few], constants),
+            *self._local_differences_of_few(first, second, few, levels, constants),
             *(
-                self._local_difference(first, second, number, levels[number], constants)
-                for number in range(few, len(levels))
+                self._local_difference(first, second, number, levels.only(number), constants)
+                for number in range(few, len(first.details))
             ),
         )
 
     def _local_differences_of_few(
-        self, first: Cortex, second: Cortex, levels: list[Level], constants: dict[str, Tensor]
+        self, first: Cortex, second: Cortex, few: int, levels: Levels, constants: dict[str, Tensor]
     ) -> list[Tensor]:
-        """Return the local visual differences of the coarsest levels, their nodes in a row."""
-        if not levels:
+        """Return the local visual differences of the ``few`` coarsest levels, nodes in a row."""
+        if few == 0:
             return []
-        sizes = [_size(detail) for detail in first.details[: len(levels)]]
+        sizes = [_size(detail) for detail in first.details[:few]]
         nodes = [math.prod(size) for size in sizes]
         details, parents = [], []
         for cortex in (first, second):
-            details.append(_in_a_row(cortex.details[: len(levels)]))
-            lowpass = (cortex.parent_lowpass(number) for number in range(len(levels)))
+            details.append(_in_a_row(cortex.details[:few]))
+            lowpass = (cortex.parent_lowpass(number) for number in range(few))
             pushed = [push(plane, size) for plane, size in zip(lowpass, sizes, strict=True)]
             parents.append(_in_a_row(pushed))
-        sights = self._sights(_levels_in_a_row(levels, nodes), constants, parents)
+        sights = self._sights(levels.in_a_row(nodes), constants, parents)
         difference = _response_difference(
             details[0], details[1], sights[0], sights[1], *self._options(constants)
         )
-        return [
-            self._gathered(part.unflatten(-1, size).squeeze(-3), constants["summation_exponent"])
-            for part, size in zip(difference.split(nodes, -1), sizes, strict=True)
-        ]
+        pooled = [self._pooled(plane) for plane in _planes(difference, sizes)]
+        row, exponent = _in_a_row(pooled), constants["summation_exponent"]
+        if self.transform.shifts == 1:
+            local = local_visual_difference(row, exponent)
+        else:
+            local = local_visual_difference_of_energy(row, exponent)
+        return _planes(local, [_size(plane) for plane in pooled])
+
+    def _pooled(self, difference: Tensor) -> Tensor:
+        """Return response differences after spatial pooling, squared where nodes overlap."""
+        if self.transform.shifts == 1:
+            return pool(surround(difference)) if self.effects.pooling else difference
+        nodes = 3 if self.effects.pooling else 1
+        surrounded = surround_halves(phase_energy(difference, self.transform.phases), nodes)
+        return pool_halves(pool_halves(surrounded, nodes, -1), nodes, -2)
 
     def _local_difference(
         self,
@@ -553,24 +590,17 @@ class VDM(TiledMetric):
         local = self.observer.adaptation_luminance is None
         return [look(parent, level, constants, local, self.effects.chromatic) for parent in parents]
 
-    def _levels(self, cortex: Cortex, constants: dict[str, Tensor]) -> list[Level]:
-        """Return what each level of ``cortex`` responds to, level 0 (the coarsest) first.
+    def _levels(self, cortex: Cortex, constants: dict[str, Tensor]) -> Levels:
+        """Return what the levels of ``cortex`` respond to, level 0 (the coarsest) first.
 
         All levels at once: on small images the operations of a level cost more than its numbers.
         """
         count = len(cortex.details)
-        if count == 0:
-            return []
         some = slice(cortex.finest, cortex.finest + count)
         frequency, gain = (constants[name][some].flip(0) for name in ("frequencies", "gains"))
         passed = self._passed(frequency[:, 0], constants)
         bright = self._bright(frequency, gain, constants)
-        # Copies, for compiled code is specialised on the offset of a view.
-        columns = (
-            [row[..., None, None].clone() for row in part]
-            for part in (passed, frequency, gain, bright)
-        )
-        return [Level(*row) for row in zip(*columns, strict=True)]
+        return Levels(passed, frequency, gain, bright)
 
     def _passed(self, frequency: Tensor, constants: dict[str, Tensor]) -> Tensor:
         """Return the share (levels, 3) of the cones' details that chromatic aberration leaves."""
@@ -606,15 +636,10 @@ def _in_a_row(planes: Iterable[Tensor]) -> Tensor:
     return torch.cat([plane.flatten(-2) for plane in planes], -1).unsqueeze(-2)
 
 
-def _levels_in_a_row(levels: Sequence[Level], nodes: Sequence[int]) -> Level:
-    """Return several levels as one, whose planes are the ``nodes`` of each in a row."""
-    device = levels[0].passed.device
-    count = torch.tensor(nodes, device=device)
-    # For each node its level; the size is given so that nothing is read back from the device.
-    which = torch.repeat_interleave(
-        torch.arange(len(nodes), device=device), count, output_size=sum(nodes)
-    )
-    return Level(*(torch.cat(part, -1)[..., which] for part in zip(*levels, strict=True)))
+def _planes(row: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Tensor]:
+    """Return the planes (..., h, w) of nodes in a row, (..., 1, all of them)."""
+    parts = row.squeeze(-2).split([math.prod(size) for size in sizes], -1)
+    return [part.unflatten(-1, size) for part, size in zip(parts, sizes, strict=True)]
 
 
 def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) -> Tensor:
