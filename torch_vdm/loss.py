@@ -49,8 +49,8 @@ class VDMLoss(nn.Module):
     reduction
         Over the batch: "mean", "sum", or "none" for one value an item, (B,).
     checkpoint
-        Whether to keep little for the backward pass and compute the rest again there: half the
-        memory for a third more time, with the same gradients. Not with `torch.func`.
+        Whether to keep little for the backward pass and compute the rest again there: about a
+        third less memory for a third more time, with the same gradients. Not with `torch.func`.
 
     Raises
     ------
