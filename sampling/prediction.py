@@ -5,6 +5,7 @@ is: they place samples. *Simulation* says how large its maximum is: it stops.
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -142,7 +143,7 @@ class Model:
             draws = min(max(SIMULATED // (height * width), FEWEST_DRAWS), MOST_DRAWS)
         few = max(draws // 4, 2)
         step = min(max(1, AT_ONCE // (3 * height * width)), few)
-        truth, to_cones = _single(self.truth), self.to_cones.float()
+        truth, to_cones = _each(self.truth, Tensor.float), self.to_cones.float()
         largest = np.empty(0)
         visible = torch.zeros((), dtype=torch.float64)
         while len(largest) < draws and not (len(largest) >= few and largest.mean() > tolerance):
@@ -245,19 +246,15 @@ def _factor(covariance: Tensor) -> Tensor:
     )
 
 
-def _single(cortex: Cortex) -> Cortex:
-    """Return the representation in single precision."""
+def _each(cortex: Cortex, function: Callable[[Tensor], Tensor]) -> Cortex:
+    """Return the representation with every plane as a function makes it."""
     return Cortex(
-        tuple(d.float() for d in cortex.details),
-        tuple(p.float() for p in cortex.lowpass),
-        cortex.mean.float(),
+        tuple(map(function, cortex.details)),
+        tuple(map(function, cortex.lowpass)),
+        function(cortex.mean),
     )
 
 
 def _batch(cortex: Cortex, batch: int) -> Cortex:
     """Return the representation repeated ``batch`` times."""
-    return Cortex(
-        tuple(d.expand(batch, *d.shape[1:]) for d in cortex.details),
-        tuple(p.expand(batch, *p.shape[1:]) for p in cortex.lowpass),
-        cortex.mean.expand(batch, *cortex.mean.shape[1:]),
-    )
+    return _each(cortex, lambda plane: plane.expand(batch, *plane.shape[1:]))

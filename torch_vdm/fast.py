@@ -5,6 +5,7 @@ from functools import cache
 from typing import Any
 
 import torch
+from torch import Tensor
 
 # Planes with fewer numbers stay uncompiled: a compiled call costs more than they do.
 # Status: choice.
@@ -43,3 +44,8 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
             shapes.use_duck_shape, dynamo.recompile_limit = before
 
     return call
+
+
+def step(function: Callable[..., Any], plane: Tensor, fast: bool) -> Callable[..., Any]:
+    """Return a step's compiled form where it pays."""
+    return compiled(function) if fast and plane.numel() >= SMALLEST else function

@@ -13,11 +13,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from torch_vdm.cortex import oriented
-from torch_vdm.cortex.gaussian import along, expand, lowpass_response, reduce, response, step
+from torch_vdm.cortex.gaussian import along, expand, lowpass_response, reduce, response
 from torch_vdm.csf import barten
 from torch_vdm.display import BT709_TO_XYZ, Display
 from torch_vdm.distance import local_visual_difference
-from torch_vdm.fast import SMALLEST
+from torch_vdm.fast import SMALLEST, step
 from torch_vdm.masking import energy_transducer
 from torch_vdm.pair import Nonfinite, PairMetric
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_vdm.cortex import Cortex, Transform
+from torch_vdm.cortex.transform import Base
 from torch_vdm.distance import accumulate, just_noticeable
 from torch_vdm.observer import Observer
 from torch_vdm.pair import PairMetric, masked
@@ -19,6 +20,7 @@ from torch_vdm.tiling import (
     Source,
     Tiling,
     check_sources,
+    cut,
     read,
 )
 
@@ -232,14 +234,9 @@ class TiledMetric(PairMetric):
                 for n in range(0, len(tiles), tiling.across)
             ]
             plane = torch.cat(rows, -2)
-            mean = (total / pixels).to(plane)
-            coarse.append(self.transform.resume(plane, octaves, tiling.size, mean, *options))
+            base = Base(plane, octaves, tiling.size, (total / pixels).to(plane))
+            coarse.append(self.transform.resume(base, *options))
         return coarse
-
-
-def cut(plane: Tensor, part: Slices) -> Tensor:
-    """Return a part of a plane (B, C, h, w)."""
-    return plane[..., part[0], part[1]].contiguous()
 
 
 def _size(part: Slices) -> tuple[int, int]:

@@ -142,6 +142,11 @@ class Tiling:
         return slice(max(side.start - self.halo, 0), min(side.stop + self.halo, length))
 
 
+def cut(plane: Tensor, part: Slices) -> Tensor:
+    """Return a part of a plane (B, C, h, w)."""
+    return plane[..., part[0], part[1]].contiguous()
+
+
 def read(source: Source, item: int, part: Slices) -> Tensor:
     """Return a part of an item of a source, (1, 3, h, w), of floating point."""
     index = (slice(None), *part) if len(source.shape) == 3 else (item, slice(None), *part)

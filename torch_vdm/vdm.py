@@ -17,7 +17,7 @@ from torch_vdm.contrast import (
     weber_contrast,
 )
 from torch_vdm.cortex import DEEPEST, Cortex, Haar, Transform, bands
-from torch_vdm.cortex.transform import mean_of
+from torch_vdm.cortex.transform import Base, mean_of
 from torch_vdm.csf import bandpass, barten, butterworth
 from torch_vdm.display import BT709_TO_XYZ, Display
 from torch_vdm.distance import (
@@ -27,7 +27,7 @@ from torch_vdm.distance import (
     local_visual_difference_of_energy,
 )
 from torch_vdm.effects import Effects
-from torch_vdm.fast import SMALLEST, compiled
+from torch_vdm.fast import SMALLEST, compiled, step
 from torch_vdm.masking import energy_transducer, signed_transducer
 from torch_vdm.matrix import mix, product
 from torch_vdm.observer import Observer
@@ -35,8 +35,8 @@ from torch_vdm.pair import Nonfinite
 from torch_vdm.pooling import glance, phase_energy, pool, pool_halves, surround, surround_halves
 from torch_vdm.quadtree import push
 from torch_vdm.sarnoff import Sarnoff
-from torch_vdm.tiled import TiledMetric, cut
-from torch_vdm.tiling import Tiling
+from torch_vdm.tiled import TiledMetric
+from torch_vdm.tiling import Tiling, cut
 
 # Planes with more numbers are computed in parts. Status: choice, measured.
 LARGEST_AT_ONCE = 2**18
@@ -242,6 +242,8 @@ class VDM(TiledMetric):
         size, octaves = _size(test), STRIP_LEVELS
         options = self._fast, self.observer.true_means
         constants = self._constants(test.dtype)
+        # One level more than are computed, for the parents of the last.
+        levels = self._levels(0, octaves + 1, constants)
         # For each level, coarser first, what its nodes have in each strip.
         fine: list[list[Tensor]] = [[] for _ in range(octaves)]
         # For each image, the means of nodes of 2^octaves pixels, and those of rows.
@@ -251,12 +253,10 @@ class VDM(TiledMetric):
             strips: list[Cortex] = []
             for number, image in enumerate((test, reference)):
                 cones = self._cone_planes(cut(image, strip.around))
-                # One level more, for the parents of the last.
                 cortex = haar.begin(cones, octaves + 1, *options)
                 means[number].append(cut(cortex.lowpass[1], strip.within(2**octaves)))
                 means_of_rows[number].append(cut(cones, strip.within(1)).mean(-1, keepdim=True))
                 strips.append(cortex)
-            levels = self._levels(strips[0], constants)
             for number in range(1, octaves + 1):
                 level = levels.only(number)
                 local = self._local_difference(strips[0], strips[1], number, level, constants)
@@ -264,7 +264,7 @@ class VDM(TiledMetric):
                 fine[number - 1].append(cut(local, strip.within(node)))
         first, second = (
             haar.coarser(
-                torch.cat(parts, -2), octaves, size, mean_of(torch.cat(rows, -2)), *options
+                Base(torch.cat(parts, -2), octaves, size, mean_of(torch.cat(rows, -2))), *options
             )
             for parts, rows in zip(means, means_of_rows, strict=True)
         )
@@ -365,15 +365,13 @@ class VDM(TiledMetric):
         for scale, around, lowpass in zip(*parted, strict=True):
             some = slice(first, first + len(scale))
             first = some.stop
-            fast = self._fast and lowpass.numel() >= SMALLEST
             at_places = None
             if local is not None:
-                weigh = compiled(_band_sensitivity) if fast else _band_sensitivity
+                weigh = step(_band_sensitivity, lowpass, self._fast)
                 rows = torch.cat((local[some], local[-1:]))
-                at_places = bands.expanded(
-                    weigh(lowpass, rows, constants), (around.shape[-2], around.shape[-1]), fast
-                )
-            contrast = compiled(_band_contrast) if fast else _band_contrast
+                weights_there = weigh(lowpass, rows, constants)
+                at_places = bands.expanded(weights_there, _size(around), self._fast)
+            contrast = step(_band_contrast, lowpass, self._fast)
             seen.append(
                 contrast(
                     scale,
@@ -423,7 +421,7 @@ class VDM(TiledMetric):
         """
         constants = self._constants(cortex.lowpass[0].dtype)
         responses = []
-        levels = self._levels(cortex, constants)
+        levels = self._levels(cortex.finest, len(cortex.details), constants)
         for number, detail in enumerate(cortex.details):
             level, parent = levels.only(number), cortex.parent_lowpass(number)
             (sight,) = self._sights(level, constants, [parent])
@@ -466,7 +464,7 @@ class VDM(TiledMetric):
         One (B, 1, h, w) a level, level 0 first.
         """
         constants = self._constants(first.lowpass[0].dtype)
-        levels = self._levels(first, constants)
+        levels = self._levels(first.finest, len(first.details), constants)
         few = sum(math.prod(_size(detail)) <= FEW_NODES for detail in first.details)
         return (
             *self._local_differences_of_few(first, second, few, levels, constants),
@@ -494,21 +492,8 @@ class VDM(TiledMetric):
         difference = _response_difference(
             details[0], details[1], sights[0], sights[1], *self._options(constants)
         )
-        pooled = [self._pooled(plane) for plane in _planes(difference, sizes)]
-        row, exponent = _in_a_row(pooled), constants["summation_exponent"]
-        if self.transform.shifts == 1:
-            local = local_visual_difference(row, exponent)
-        else:
-            local = local_visual_difference_of_energy(row, exponent)
-        return _planes(local, [_size(plane) for plane in pooled])
-
-    def _pooled(self, difference: Tensor) -> Tensor:
-        """Return response differences after spatial pooling, squared where nodes overlap."""
-        if self.transform.shifts == 1:
-            return pool(surround(difference)) if self.effects.pooling else difference
-        nodes = 3 if self.effects.pooling else 1
-        surrounded = surround_halves(phase_energy(difference, self.transform.phases), nodes)
-        return pool_halves(pool_halves(surrounded, nodes, -1), nodes, -2)
+        exponent = constants["summation_exponent"]
+        return [self._gathered(plane, exponent) for plane in _planes(difference, sizes)]
 
     def _local_difference(
         self,
@@ -532,6 +517,11 @@ class VDM(TiledMetric):
         at_once = orientations
         if not fast and details.numel() > LARGEST_AT_ONCE:
             at_once = self.transform.phases
+
+        def gathered(*arguments: Any) -> Tensor:
+            difference = respond(*arguments)
+            return self._gathered(difference, constants["summation_exponent"], fast)
+
         local = []
         for plane in range(0, orientations, at_once):
             some = slice(plane, plane + at_once)
@@ -542,10 +532,6 @@ class VDM(TiledMetric):
                 other_sight.of(some),
                 *self._options(constants),
             )
-
-            def gathered(*arguments: Any) -> Tensor:
-                difference = respond(*arguments)
-                return self._gathered(difference, constants["summation_exponent"], fast)
 
             local.append(self._kept(gathered, *arguments))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]
@@ -590,13 +576,12 @@ class VDM(TiledMetric):
         local = self.observer.adaptation_luminance is None
         return [look(parent, level, constants, local, self.effects.chromatic) for parent in parents]
 
-    def _levels(self, cortex: Cortex, constants: dict[str, Tensor]) -> Levels:
-        """Return what the levels of ``cortex`` respond to, level 0 (the coarsest) first.
+    def _levels(self, finest: int, count: int, constants: dict[str, Tensor]) -> Levels:
+        """Return what ``count`` levels respond to, from the level ``finest``; the coarsest first.
 
         All levels at once: on small images the operations of a level cost more than its numbers.
         """
-        count = len(cortex.details)
-        some = slice(cortex.finest, cortex.finest + count)
+        some = slice(finest, finest + count)
         frequency, gain = (constants[name][some].flip(0) for name in ("frequencies", "gains"))
         passed = self._passed(frequency[:, 0], constants)
         bright = self._bright(frequency, gain, constants)
@@ -705,12 +690,17 @@ def _sight(
     return Sight(scale, _sensitivity(parent, level, constants, chromatic))
 
 
+def _luminance(lowpass: Tensor, constants: dict[str, Tensor]) -> Tensor:
+    """Return the luminance (B, 1, h, w) that the eye is adapted to, cd/m2, its own light in it."""
+    seen = mix(constants["luminance_of_cones"], lowpass).clamp_min(0.0)
+    return seen + constants["dark_light"]
+
+
 def _sensitivity(
     parent: Tensor, level: Level, constants: dict[str, Tensor], chromatic: bool
 ) -> Tensor:
     """Return the contrast sensitivity in the local luminance, at the parents."""
-    seen = mix(constants["luminance_of_cones"], parent).clamp_min(0.0)
-    luminance = (seen + constants["dark_light"]).unsqueeze(2)
+    luminance = _luminance(parent, constants).unsqueeze(2)
     dark = torch.log2(1.0 + constants["dim_luminance"] / luminance)
     glare = torch.log2(1.0 + luminance / constants["glare_luminance"])
     faint = torch.log2(1.0 + constants["peak_luminance"] / luminance)
@@ -731,7 +721,7 @@ def _band_sensitivity(lowpass: Tensor, table: Tensor, constants: dict[str, Tenso
 
     ``lowpass`` is (B, 3, h, w); ``table`` is at `LUMINANCES`, and between them linear.
     """
-    seen = mix(constants["luminance_of_cones"], lowpass).clamp_min(0.0) + constants["dark_light"]
+    seen = _luminance(lowpass, constants)
     last = len(LUMINANCES) - 1
     place = (torch.log2(seen[:, 0]) - LUMINANCES[0]).clamp(0.0, last)
     low = place.detach().floor().clamp_max(last - 1.0)

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.cortex.gaussian import along, response, step
+from torch_vdm.cortex.gaussian import along, response
 from torch_vdm.cortex.transform import DEEPEST
+from torch_vdm.fast import step
 
 # Weights of the lowpass that parts the finest octave: half is left at a quarter of a cycle a pixel.
 # Status: choice.

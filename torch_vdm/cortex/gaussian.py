@@ -7,14 +7,13 @@ would filter the rows anew for each tap of a column.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.fast import SMALLEST, compiled
+from torch_vdm.fast import step
 
 # Weights of the lowpass, of sum 1; a = 3/8. Status: source.
 CENTRE, NEXT, OUTER = 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0
@@ -78,11 +77,6 @@ def expand(plane: Tensor, size: tuple[int, int], fast: bool = False) -> Tensor:
     rows: Tensor = step(_expanded_rows, plane, fast)(plane, size[1])
     columns: Tensor = step(_expanded_columns, plane, fast)(rows, size[0])
     return columns
-
-
-def step(function: Callable[..., Any], plane: Tensor, fast: bool) -> Callable[..., Any]:
-    """Return a step's compiled form where it pays."""
-    return compiled(function) if fast and plane.numel() >= SMALLEST else function
 
 
 def _blurred_rows(plane: Tensor) -> Tensor:

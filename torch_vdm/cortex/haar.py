@@ -7,8 +7,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torch_vdm.cortex.transform import CSF, DEEPEST, Cortex, checked_csf, mean_of
-from torch_vdm.fast import SMALLEST, compiled
+from torch_vdm.cortex.transform import CSF, DEEPEST, Base, Cortex, checked_csf, mean_of
+from torch_vdm.fast import step
 from torch_vdm.quadtree import complete, own, pad_even
 
 # The exponent of the sum over coefficients by which a diagonal grating is made as strong as a
@@ -58,17 +58,14 @@ class Haar:
             ``details[l]`` is (B, C, 3, h, w): d1 (horizontal), d2 (vertical), d3 (diagonal).
         """
         size = (planes.shape[-2], planes.shape[-1])
-        mean = mean_of(planes)
-        details, lowpass = levels(planes, 1, size, fast, true_means)
-        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [planes])), mean)
+        return self.coarser(Base(planes, 0, size, mean_of(planes)), fast, true_means)
 
     def begin(
         self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
     ) -> Cortex:
         """Return the ``count`` finest levels of `decompose`, without a mean; arguments as there."""
         size = (planes.shape[-2], planes.shape[-1])
-        details, lowpass = levels(planes, 1, size, fast, true_means, count)
-        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass)), planes[..., :1, :1])
+        return self.coarser(Base(planes, 0, size, planes[..., :1, :1]), fast, true_means, count)
 
     def reduced(
         self, planes: Tensor, octaves: int, fast: bool = False, true_means: bool = False
@@ -77,35 +74,23 @@ class Haar:
         size = (planes.shape[-2], planes.shape[-1])
         return [planes, *levels(planes, 1, size, fast, true_means, octaves)[1]][octaves]
 
-    def resume(
-        self,
-        plane: Tensor,
-        octaves: int,
-        size: tuple[int, int],
-        mean: Tensor,
-        fast: bool = False,
-        true_means: bool = False,
-    ) -> Cortex:
-        """Decompose what `reduced` gives; see `Transform.resume`."""
+    def resume(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
+        """Decompose the rest of an image; see `Transform.resume`."""
         # The first step is a level that tiles have.
-        _, (plane,) = levels(plane, 2**octaves, size, fast, true_means, 1)
-        return self.coarser(plane, octaves + 1, size, mean, fast, true_means)
+        _, (plane,) = levels(base.plane, 2**base.octaves, base.size, fast, true_means, 1)
+        rest = base._replace(plane=plane, octaves=base.octaves + 1)
+        return self.coarser(rest, fast, true_means)
 
     def coarser(
-        self,
-        plane: Tensor,
-        octaves: int,
-        size: tuple[int, int],
-        mean: Tensor,
-        fast: bool = False,
-        true_means: bool = False,
+        self, base: Base, fast: bool = False, true_means: bool = False, count: int = DEEPEST
     ) -> Cortex:
-        """Return the levels of `decompose` without its ``octaves`` finest.
+        """Return the levels of `decompose`, at most ``count``, without its ``base.octaves`` finest.
 
-        ``plane`` has the means of nodes of 2^octaves pixels; other arguments as in `resume`.
+        The plane of ``base`` has the means of nodes of 2^octaves pixels.
         """
-        details, lowpass = levels(plane, 2**octaves, size, fast, true_means)
-        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass)), mean, octaves)
+        plane, octaves, size, mean = base
+        details, lowpass = levels(plane, 2**octaves, size, fast, true_means, count)
+        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [plane])), mean, octaves)
 
     def peak(self, level_from_finest: int) -> tuple[float, float]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there."""
@@ -139,12 +124,12 @@ def levels(
     details: list[Tensor] = []
     lowpass: list[Tensor] = []
     while max(planes.shape[-2:]) > 1 and len(details) < count:
-        step = compiled(_analyse) if fast and planes.numel() >= SMALLEST else _analyse
+        analyse = step(_analyse, planes, fast)
         if true_means:
-            mean_of_all, detail = step(complete(planes, size, node))
+            mean_of_all, detail = analyse(complete(planes, size, node))
             planes = own(mean_of_all, planes, size, node)
         else:
-            planes, detail = step(pad_even(planes))
+            planes, detail = analyse(pad_even(planes))
         details.append(detail)
         lowpass.append(planes)
         node *= 2
@@ -177,7 +162,7 @@ def _peak(level_from_finest: int) -> tuple[float, float]:
         once, many = math.pi * middle, math.pi * m * middle
         slope = 2.0 * m * math.sin(once) * math.cos(many) - math.cos(once) * math.sin(many)
         low, high = (middle, high) if slope > 0.0 else (low, middle)
-    return low, math.sin(math.pi * m * low) ** 2 / (m * math.sin(math.pi * low))
+    return low, wavelet_response(m, low)
 
 
 def wavelet_response(half: int, frequency: float) -> float:

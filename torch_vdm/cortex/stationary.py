@@ -16,8 +16,8 @@ from torch_vdm.cortex.haar import (
     wavelet_response,
     window_response,
 )
-from torch_vdm.cortex.transform import CSF, Cortex, checked_csf, mean_of
-from torch_vdm.fast import SMALLEST, compiled
+from torch_vdm.cortex.transform import CSF, Base, Cortex, checked_csf, mean_of
+from torch_vdm.fast import step
 from torch_vdm.quadtree import share
 
 
@@ -80,19 +80,11 @@ class StationaryHaar:
         """Return the means of nodes of 2^octaves pixels; arguments as `decompose`."""
         return Haar().reduced(planes, octaves, fast, true_means)
 
-    def resume(
-        self,
-        plane: Tensor,
-        octaves: int,
-        size: tuple[int, int],
-        mean: Tensor,
-        fast: bool = False,
-        true_means: bool = False,
-    ) -> Cortex:
-        """Decompose what `reduced` gives; see `Transform.resume`."""
-        details, means = levels(plane, 2**octaves, size, fast, true_means)
-        parts = [plane, *means][: len(details) - 1]
-        return _cortex(parts, octaves + 1, size, mean, fast, true_means)
+    def resume(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
+        """Decompose the rest of an image; see `Transform.resume`."""
+        details, means = levels(base.plane, 2**base.octaves, base.size, fast, true_means)
+        parts = [base.plane, *means][: len(details) - 1]
+        return _cortex(parts, base.octaves + 1, base.size, base.mean, fast, true_means)
 
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
         """Return the best frequency, cycles/pixel, and its gain for d1, d2 and d3.
@@ -118,8 +110,7 @@ def _cortex(
     for level, part in enumerate(parts, finest):
         faded = _faded(part, size, 2 ** max(level - 1, 0)) if true_means else part
         analyse = _halves if level == 0 else _quarters
-        use = compiled(analyse) if fast and part.numel() >= SMALLEST else analyse
-        lowest, detail = use(faded)
+        lowest, detail = step(analyse, part, fast)(faded)
         details.append(detail)
         lowpass.append(lowest)
     return Cortex(tuple(reversed(details)), tuple(reversed(lowpass)), mean, finest)

@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from torch_vdm.cortex import oriented
-from torch_vdm.cortex.gaussian import blur, lowpass_response, step
-from torch_vdm.cortex.transform import CSF, DEEPEST, Cortex, mean_of
-from torch_vdm.fast import SMALLEST
+from torch_vdm.cortex.gaussian import blur, lowpass_response
+from torch_vdm.cortex.transform import CSF, DEEPEST, Base, Cortex, mean_of
+from torch_vdm.fast import SMALLEST, step
 
 # The image half-way between its pixels, which the finest level needs: a sinc of so many taps on
 # either side, under a Hann window. Status: choice.
@@ -97,16 +97,14 @@ class Steerable:
 
     def resume(
         self,
-        plane: Tensor,
-        octaves: int,
-        size: tuple[int, int],  # noqa: ARG002
-        mean: Tensor,
+        base: Base,
         fast: bool = False,
-        true_means: bool = False,  # noqa: ARG002
+        true_means: bool = False,  # noqa: ARG002  # as in `decompose`
     ) -> Cortex:
-        """Decompose what `reduced` gives; see `Transform.resume`."""
-        smooth = blur(plane, fast)
-        return self._cortex(_dropped(smooth), plane - smooth, octaves + 1, mean, fast)
+        """Decompose the rest of an image; see `Transform.resume`."""
+        smooth = blur(base.plane, fast)
+        band = base.plane - smooth
+        return self._cortex(_dropped(smooth), band, base.octaves + 1, base.mean, fast)
 
     def _cortex(self, plane: Tensor, band: Tensor, finest: int, mean: Tensor, fast: bool) -> Cortex:
         """Return the levels from ``finest`` on, of its plane and the band that it is made of."""

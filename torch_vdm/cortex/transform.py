@@ -44,6 +44,27 @@ class Cortex(NamedTuple):
         return self.lowpass[max(level - 1, 0)]
 
 
+class Base(NamedTuple):
+    """What the coarser levels of an image are decomposed from.
+
+    Attributes
+    ----------
+    plane
+        (B, C, h, w), the image at 1 / 2^octaves of its sides, rounded up.
+    octaves
+        0 for the image itself.
+    size
+        (H, W) of the image.
+    mean
+        (B, C, 1, 1), that of the image.
+    """
+
+    plane: Tensor
+    octaves: int
+    size: tuple[int, int]
+    mean: Tensor
+
+
 class Transform(Protocol):
     """A decomposition into levels on a quad-tree, and what each level responds to."""
 
@@ -88,19 +109,10 @@ class Transform(Protocol):
     ) -> Tensor:
         """Return (B, C, H, W) at 1 / 2^octaves of its sides, rounded up: what `resume` takes."""
 
-    def resume(
-        self,
-        plane: Tensor,
-        octaves: int,
-        size: tuple[int, int],
-        mean: Tensor,
-        fast: bool = False,
-        true_means: bool = False,
-    ) -> Cortex:
-        """Return the levels of `decompose` without its ``octaves`` + 1 finest.
+    def resume(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
+        """Return the levels of `decompose` without its ``base.octaves`` + 1 finest.
 
-        From what `reduced` gives of an image of ``size`` = (H, W) and ``mean`` (B, C, 1, 1), so
-        that an image larger than memory is decomposed in tiles.
+        From what `reduced` gives, so that an image larger than memory is decomposed in tiles.
         """
 
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
