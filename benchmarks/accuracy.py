@@ -9,9 +9,7 @@ replaces its own half of accuracy.json, so that times can be taken on a quiet ma
 import io
 import json
 import math
-import os
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -27,7 +25,8 @@ from torch import Tensor
 from benchmarks import record
 from benchmarks.calibrate import HIGHEST_CONTRAST, MECHANISMS, by_mechanism, centred
 from benchmarks.peers import Peer, clipped, installed
-from benchmarks.speed import images, status
+from benchmarks.places import shared_data
+from benchmarks.speed import images, peak_megabytes
 from benchmarks.thresholds import Threshold, pattern, read_thresholds, render, sampling
 from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar, Steerable
 from torch_vdm.cortex import Transform
@@ -232,13 +231,12 @@ def gratings(value: Any, metric: Any, frequencies: tuple[float, ...]) -> dict[st
 def pictures(quick: bool) -> dict[str, tuple[Tensor, Tensor]]:
     """Return pairs of test and reference, sRGB-coded (1, 3, H, W): photographs and a scene."""
     # Without the shared photographs the scene alone is judged.
-    folder = Path(os.environ.get("TORCH_VDM_DATA", Path(__file__).parents[2] / "shared" / "data"))
     pairs: dict[str, tuple[Tensor, Tensor]] = {}
     from PIL import Image
 
     generator = torch.Generator().manual_seed(1)
     y, x = torch.meshgrid(*2 * (torch.arange(256.0),), indexing="ij")
-    for path in sorted((folder / "ldr").glob("*.png"))[: 1 if quick else 5]:
+    for path in sorted((shared_data() / "ldr").glob("*.png"))[: 1 if quick else 5]:
         array = np.asarray(Image.open(path).convert("RGB"), dtype=np.float32)[100:356, 100:356]
         photo = torch.from_numpy(array / 255.0).permute(2, 0, 1)[None]
         noise = 0.02 * torch.randn(photo.shape, generator=generator)
@@ -484,11 +482,7 @@ def times(quick: bool) -> dict[str, Any]:
 
 def _memory(name: str, size: tuple[int, int], backward: bool) -> float:
     """Return the MB that a call takes at most over what stood before, in a new process."""
-    command = [sys.executable, "-m", "benchmarks.accuracy", name, *map(str, size), str(backward)]
-    done = subprocess.run(
-        command, cwd=Path(__file__).parent.parent, stdout=subprocess.PIPE, check=True
-    )
-    return float(done.stdout.split()[-1])
+    return record.measured_apart("accuracy", name, *size, backward)["megabytes"]
 
 
 def _peak(name: str, size: tuple[int, int], backward: bool) -> float:
@@ -496,10 +490,7 @@ def _peak(name: str, size: tuple[int, int], backward: bool) -> float:
     call = timed()[name]()
     _once(call, *images((192, 192)), backward)
     test, reference = images(size)
-    Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-    before = status("VmRSS")
-    _once(call, test, reference, backward)
-    return (status("VmHWM") - before) / 1e3
+    return peak_megabytes(lambda: _once(call, test, reference, backward))
 
 
 # The result
@@ -612,13 +603,9 @@ def _more(found: dict[str, Any]) -> list[str]:
 
 def plot(result: dict[str, Any], path: Path) -> None:
     """Draw error against time: the ladder as a line, peers as points, the paper's 1/60 marked."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     human, cost = result["errors"]["human"], result["times"]["forward_ms"]
     held_out = result["errors"]["held_out"]
-    figure = Figure(figsize=(8.0, 4.6), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = record.blank_figure(8.0, 4.6)
     axes = figure.subplots(1, 2, sharex=True)
     alike = {name: of["one_gain_a_study"]["achromatic"] for name, of in human.items()}
     panels = (
@@ -697,4 +684,5 @@ def _label(axis: Any, name: str, x: float, y: float, colour: str) -> None:
 
 
 if __name__ == "__main__":
-    print(_peak(sys.argv[1], (int(sys.argv[2]), int(sys.argv[3])), sys.argv[4] == "True"))
+    size = int(sys.argv[2]), int(sys.argv[3])
+    print(json.dumps({"megabytes": _peak(sys.argv[1], size, sys.argv[4] == "True")}))

@@ -16,7 +16,6 @@ interrupted benchmark goes on where it was.
 """
 
 import dataclasses
-import functools
 import hashlib
 import json
 import math
@@ -30,6 +29,8 @@ import torch
 from numpy.typing import NDArray
 
 import sampling
+from benchmarks.places import CACHE
+from benchmarks.record import source
 from sampling import Sampler, Settings, rounds
 from sampling.renderers.mitsuba import MitsubaRenderer, load_mitsuba
 from torch_vdm import VDM, Display, Observer
@@ -37,7 +38,8 @@ from torch_vdm.io import atomic_path
 
 Plane = NDArray[np.float64]
 
-CACHE = Path(__file__).parent / "cache"
+# Of the code that is loaded, not of what is on the disk later: another one makes other runs.
+SOURCE = source()
 
 WHITE = 100.0
 
@@ -191,7 +193,7 @@ def run_of(
     """Return a run, made where it is not kept; or None with ``kept_only``."""
     renderer = MitsubaRenderer(scene.path, scene.parameters, seed=seed)
     described = dataclasses.asdict(scene) | {"path": renderer.fingerprint, "name": ""}
-    named = [described, strategy, seed, limits, STEP, GROWTH, _source(), reference.error]
+    named = [described, strategy, seed, limits, STEP, GROWTH, SOURCE, reference.error]
     path = CACHE / f"run-{_hash(named)}.npz"
     if not path.exists() and kept_only:
         return None
@@ -319,15 +321,3 @@ def charged(strategy: str, points: list[dict[str, float]]) -> list[dict[str, flo
 
 def _hash(named: list[Any]) -> str:
     return hashlib.sha256(json.dumps(named, default=str, sort_keys=True).encode()).hexdigest()[:20]
-
-
-@functools.cache
-def _source() -> str:
-    """Return a hash of the sampler's own code: another one makes other runs."""
-    folder = Path(sampling.__file__).parent
-    files = sorted(set(folder.glob("*.py")) - {folder / "cli.py", folder / "checkpoint.py"})
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
-
-
-# Of the code that is loaded, not of what is on the disk later.
-_source()

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -96,18 +95,12 @@ def _simple(test: Tensor, reference: Tensor) -> dict[str, float]:
 
 
 def _flip() -> Judge:
-    import flip_evaluator
+    from benchmarks.flip import flip
 
     def judge(test: Tensor, reference: Tensor) -> dict[str, float]:
-        figures = {}
-        for name, kind, of in (("FLIP", "LDR", _shown), ("HDR-FLIP", "HDR", torch.clone)):
-            pair = [
-                np.ascontiguousarray(of(image)[0].permute(1, 2, 0).numpy())
-                for image in (reference, test)
-            ]
-            _, mean, _ = flip_evaluator.evaluate(*pair, kind, parameters={"ppd": PPD})
-            figures[name] = float(mean)
-        return figures
+        shown = flip(_shown(test)[0], _shown(reference)[0], PPD)
+        light = flip(test[0], reference[0], PPD, "HDR")
+        return {"FLIP": float(shown.mean()), "HDR-FLIP": float(light.mean())}
 
     return judge
 

@@ -7,7 +7,6 @@ the system has not written out yet, everything.
 
 import json
 import resource
-import subprocess
 import sys
 import tempfile
 import time
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.record import caption, circumstances, save
+from benchmarks.record import blank_figure, caption, circumstances, measured_apart, save
 from torch_vdm import VDM, Haar, StationaryHaar, Steerable
 from torch_vdm.cortex import Transform
 from torch_vdm.io import ArrayFile
@@ -60,11 +59,7 @@ def _child(accuracy: str, size: tuple[int, int], tile: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         _write_pair(Path(folder), size)
         for what in ("tiles", "difference") if height * width <= LARGEST_WHOLE else ("tiles",):
-            command = [sys.executable, "-m", "benchmarks.large", what, folder, accuracy, str(tile)]
-            done = subprocess.run(
-                command, cwd=Path(__file__).parent.parent, stdout=subprocess.PIPE, check=True
-            )
-            row |= json.loads(done.stdout)
+            row |= measured_apart("large", what, folder, accuracy, tile)
     return row
 
 
@@ -131,11 +126,7 @@ def _table(result: dict[str, Any]) -> str:
 
 
 def _plot(result: dict[str, Any], path: Path) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.0, 3.6), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(6.0, 3.6)
     axis = figure.subplots()
     rows = [row for row in result["runs"] if row["accuracy"] == "fast"]
     areas = [row["width"] * row["height"] / 1e6 for row in rows]

@@ -10,20 +10,18 @@ are any, and the still life that ships with the package.
 import dataclasses
 import json
 import math
-import os
 import statistics
 import time
-from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from benchmarks import paper_plots
 from benchmarks.curves import (
-    CACHE,
     Limits,
     Reference,
     Run,
@@ -35,14 +33,16 @@ from benchmarks.curves import (
     reference_of,
     run_of,
 )
+from benchmarks.places import CACHE
 from benchmarks.record import caption, circumstances, save
+from benchmarks.scenes import STILL_LIFE, scene_file, sized
 from sampling import Sampler, Settings, rounds
 from sampling.renderers.mitsuba import MitsubaRenderer
+from torch_vdm.display import encode_srgb
 
 Plane = NDArray[np.float64]
 
 SCENES = Path(__file__).parent / "scenes"
-ROOT = Path(__file__).resolve().parent.parent
 
 STRATEGIES = ("uniform", "objective", "halfbuffer", "perceptual")
 
@@ -176,22 +176,19 @@ def real_scenes(side: int) -> list[Scene]:
 
     The fog and the caustic are left out: a run of them takes minutes.
     """
-    size = {"resx": str(side), "resy": str(side)}
-    with as_file(files("sampling") / "scenes" / "still_life.xml") as still_life:
-        scenes = [Scene("still life", still_life, {"width": str(side), "height": str(side)})]
-    folder = Path(os.environ.get("TORCH_VDM_DATA", ROOT.parent / "shared" / "data")) / "scenes"
-    shared = {
-        "textured wall": ("textured_wall.xml", size),
-        "chequered plane": ("checker_horizon.xml", size),
-        "Cornell box": ("cbox/scene.xml", {"res": str(side)}),
-        "plates": ("mis_plates.xml", size),
-        "glass and sky": ("envmap_glass.xml", size),
-        "row of spheres": ("dof_row.xml", size),
+    names = {
+        "still life": STILL_LIFE,
+        "textured wall": "textured_wall.xml",
+        "chequered plane": "checker_horizon.xml",
+        "Cornell box": "cbox/scene.xml",
+        "plates": "mis_plates.xml",
+        "glass and sky": "envmap_glass.xml",
+        "row of spheres": "dof_row.xml",
     }
-    return scenes + [
-        Scene(name, folder / file, parameters)
-        for name, (file, parameters) in shared.items()
-        if (folder / file).is_file()
+    return [
+        Scene(name, scene_file(file), sized(file, side))
+        for name, file in names.items()
+        if scene_file(file).is_file()
     ]
 
 
@@ -268,20 +265,13 @@ def _at_equal(runs: list[Run], one: Found) -> dict[str, float] | None:
     if not runs:
         return None
     # Not one of the package's needs, and slow to import.
-    from flip_evaluator import evaluate
+    from benchmarks.flip import flip
 
-    def coded(image: Plane) -> NDArray[np.float32]:
-        clipped = torch.from_numpy(image).clamp(0.0, 1.0)
-        low, high = 12.92 * clipped, 1.055 * clipped ** (1.0 / 2.4) - 0.055
-        return torch.where(clipped <= 0.0031308, low, high).float().numpy()
+    def coded(image: Plane) -> Tensor:
+        return encode_srgb(torch.from_numpy(image).clamp(0.0, 1.0)).permute(2, 0, 1)
 
-    reference, parameters = coded(one.reference.image), {"ppd": one.scene.ppd}
-    flips = [
-        evaluate(
-            reference, coded(run.planes["image"]), "LDR", applyMagma=False, parameters=parameters
-        )[0]
-        for run in runs
-    ]
+    reference = coded(one.reference.image)
+    flips = [flip(coded(run.planes["image"]), reference, one.scene.ppd) for run in runs]
     return {
         "largest_jnd": _median([float(run.planes["jnd"].max()) for run in runs]),
         "mean_jnd": _median([float(run.planes["jnd"].mean()) for run in runs]),

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.curves import charged
+from benchmarks.record import blank_figure
 
 if TYPE_CHECKING:
     from benchmarks.paper import Found
@@ -79,11 +80,7 @@ def _images(path: Path, one: "Found", strategies: Sequence[str]) -> None:
 
 def _curves(path: Path, found: Sequence["Found"], strategies: Sequence[str]) -> None:
     """Draw the largest difference by samples and by time, each seed a line (Figs. 12, 13)."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 2.0 * len(found) + 0.5), dpi=130, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(9.0, 2.0 * len(found) + 0.5, dpi=130)
     axes = figure.subplots(
         len(found), 3, squeeze=False, gridspec_kw={"width_ratios": (0.62, 1.0, 1.0)}
     )
@@ -117,11 +114,7 @@ def _curves(path: Path, found: Sequence["Found"], strategies: Sequence[str]) -> 
 
 
 def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Any, Any]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), dpi=130, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(width, height, dpi=130)
     axes = figure.subplots(rows, columns, squeeze=False)
     for axis in axes.flat:
         axis.set_xticks([])

@@ -109,20 +109,14 @@ def _ms_ssim() -> Peer:
 
 
 def _flip() -> Peer:
-    import flip_evaluator
-
-    def error(test: Tensor, reference: Tensor, ppd: float) -> Tensor:
-        images = [i.permute(1, 2, 0).float().contiguous().numpy() for i in (reference, test)]
-        found = flip_evaluator.evaluate(*images, "LDR", True, False, False, {"ppd": ppd})
-        seen: Tensor = torch.from_numpy(found[0])[None, ..., 0]
-        return seen
+    from benchmarks.flip import flip
 
     def values(tests: Tensor, reference: Tensor, ppd: float) -> Tensor:
         pairs = zip(*_coded_pair(tests, reference), strict=True)
-        return _of_map(torch.stack([error(*pair, ppd) for pair in pairs])).double()
+        return _of_map(torch.stack([flip(*pair, ppd) for pair in pairs])).double()
 
     def timed(test: Tensor, reference: Tensor) -> Tensor:
-        return error(test[0], reference[0], 60.0)
+        return flip(test[0], reference[0], 60.0)
 
     return Peer("FLIP", values, timed)
 

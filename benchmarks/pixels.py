@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.judges import PPD, psnr
+from benchmarks.record import blank_figure
 from torch_vdm import VDM
 
 Loss = Callable[[Tensor, Tensor], Tensor]
@@ -85,11 +86,7 @@ def text(curves: dict[str, dict[str, dict[str, list[float]]]]) -> list[str]:
 
 def plot(curves: dict[str, dict[str, dict[str, list[float]]]], path: Path) -> None:
     """Draw the curves: a column for each start, PSNR above, mean JND below."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(2.3 * len(curves) + 0.6, 5.2), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(2.3 * len(curves) + 0.6, 5.2)
     axes: Any = figure.subplots(2, len(curves), sharex=True, sharey="row", squeeze=False)
     for (start, losses), (above, below) in zip(curves.items(), axes.T, strict=True):
         for number, (name, figures) in enumerate(losses.items()):

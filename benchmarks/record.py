@@ -1,16 +1,23 @@
 """What every result carries: the machine, the versions, the date and the command."""
 
 import datetime
+import hashlib
 import importlib.metadata
 import json
+import os
 import platform
+import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 import torch_vdm
+from benchmarks.places import ROOT
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PACKAGES = ("torch", "kornia", "numpy")
 
@@ -47,6 +54,37 @@ def save(folder: Path, name: str, result: dict[str, Any], table: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.json").write_text(json.dumps(result, indent=2) + "\n")
     (folder / f"{name}.md").write_text(table)
+
+
+def source() -> str:
+    """Return a hash of the packages' code, on which what is kept of an earlier run depends."""
+    digest = hashlib.sha256()
+    for folder in ("torch_vdm", "sampling"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def measured_apart(
+    module: str, *arguments: object, environment: dict[str, str] | None = None
+) -> dict[str, float]:
+    """Return what a benchmark's module prints last, JSON, in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, "-m", f"benchmarks.{module}", *map(str, arguments)],
+        env=os.environ | (environment or {}),
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        check=True,
+    )
+    figures: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return figures
+
+
+def blank_figure(width: float, height: float, dpi: int = 150) -> "Figure":
+    """Return an empty figure of so many inches; `savefig` writes it."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=dpi, layout="constrained")
 
 
 def _processor() -> str:

@@ -7,8 +7,6 @@ maps, bitmaps, an environment. No scene is in both.
 """
 
 import hashlib
-import os
-import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,10 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.rooms import room
+from benchmarks.scenes import SIDES, STILL_LIFE, scene_file
 from sampling.renderers.mitsuba import AOV_NAMES, MitsubaRenderer
-
-ROOT = Path(__file__).resolve().parent.parent
-CACHE = Path(__file__).parent / "cache"
+from torch_vdm.io import atomic_path
 
 # Samples a pixel of the noisy render, and of its reference. Status: choice.
 NOISY_SPP, REFERENCE_SPP = 64, 1024
@@ -44,25 +41,13 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)
 # Channels of what a denoiser is given: colour, albedo, normal, depth.
 CHANNELS = 3 + len(AOV_NAMES)
 
-# Names of the parameters for the size of the shared scenes; the Cornell box has its own.
-SHARED = {
-    "checker_horizon.xml": ("resx", "resy"),
-    "dof_row.xml": ("resx", "resy"),
-    "envmap_glass.xml": ("resx", "resy"),
-    "fog_spot.xml": ("resx", "resy"),
-    "mis_plates.xml": ("resx", "resy"),
-    "small_light_caustic.xml": ("resx", "resy"),
-    "textured_wall.xml": ("resx", "resy"),
-    "cbox/scene.xml": ("res",),
-}
-
 
 class Scene(NamedTuple):
     """A scene to render: a file, or the XML of a random room."""
 
     name: str
     source: Path | str
-    size: tuple[str, ...] = ("width", "height")
+    size: tuple[str, ...] = SIDES[STILL_LIFE]
 
 
 class Picture(NamedTuple):
@@ -84,13 +69,10 @@ def training_scenes(rooms: range = TRAINING_ROOMS) -> list[Scene]:
 def held_out_scenes(rooms: range = HELD_OUT_ROOMS, shared: bool = True) -> list[Scene]:
     """Return the scenes that are judged, and never trained on."""
     scenes = [Scene(f"room {seed}", room(seed)) for seed in rooms]
-    scenes.append(Scene("still life", ROOT / "sampling" / "scenes" / "still_life.xml"))
-    folder = Path(os.environ.get("TORCH_VDM_DATA", ROOT.parent / "shared" / "data")) / "scenes"
-    if shared:
-        for name, size in SHARED.items():
-            if (folder / name).is_file():
-                word = name.removesuffix(".xml").removesuffix("/scene").replace("_", " ")
-                scenes.append(Scene(word, folder / name, size))
+    for name, size in SIDES.items():
+        if scene_file(name).is_file() and (shared or name == STILL_LIFE):
+            word = name.removesuffix(".xml").removesuffix("/scene").replace("_", " ")
+            scenes.append(Scene(word, scene_file(name), size))
     return scenes
 
 
@@ -109,7 +91,8 @@ def picture(
     cache.mkdir(parents=True, exist_ok=True)
     if isinstance(scene.source, str):
         path = cache / f"{scene.name.replace(' ', '_')}.xml"
-        _write(path, scene.source.encode())
+        with atomic_path(path) as temporary:
+            temporary.write_text(scene.source)
     else:
         path = scene.source
     parameters = dict.fromkeys(scene.size, str(side))
@@ -121,9 +104,8 @@ def picture(
         if not kept.exists():
             colour = _colour(renderer, spp)
             planes = np.concatenate((colour, [*renderer.aovs().values()])) if guides else colour
-            with tempfile.NamedTemporaryFile(dir=cache, suffix=".npy", delete=False) as file:
+            with atomic_path(kept) as temporary, temporary.open("wb") as file:
                 np.save(file, planes.astype(np.float32))
-            Path(file.name).replace(kept)
         stored: NDArray[np.float32] = np.load(kept)
         return stored
 
@@ -156,10 +138,3 @@ def _exposed(name: str, noisy: NDArray[np.float32], reference: NDArray[np.float3
     depth = shots[:, -1:]
     shots[:, -1:] = depth / (depth + depth.mean().clamp_min(1e-6))
     return Picture(name, shots, torch.from_numpy(reference * np.float32(GREY / mean)))
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        file.write(content)
-    Path(file.name).replace(path)

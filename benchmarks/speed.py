@@ -7,9 +7,7 @@ begin with nothing. Two threads, sRGB noise in [0, 1], float32.
 
 import json
 import math
-import os
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -20,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.record import caption, circumstances, save
+from benchmarks.record import blank_figure, caption, circumstances, measured_apart, save
 from torch_vdm import VDM, VDMLoss
 
 THREADS = 2
@@ -147,7 +145,7 @@ def run(quick: bool, output: Path | None) -> None:
     # A compiled contender costs a smoke test half a minute in each child.
     measured = [name for name in CONTENDERS if not (quick and name in COMPILED)]
     result["peak_extra_megabytes"] = {
-        name: _child("memory", name, size)["megabytes"] for name in measured
+        name: measured_apart("speed", "memory", name, *size)["megabytes"] for name in measured
     }
     result["compile_seconds"] = _compile_times(size, COMPILED[:1] if quick else COMPILED)
     table = _table(result)
@@ -206,26 +204,12 @@ def _compile_times(size: tuple[int, int], names: tuple[str, ...]) -> dict[str, d
         with tempfile.TemporaryDirectory() as cache:
             environment = {"TORCHINDUCTOR_CACHE_DIR": cache}
             times[name] = {
-                state: _child("first", name, size, environment)["seconds"]
+                state: measured_apart("speed", "first", name, *size, environment=environment)[
+                    "seconds"
+                ]
                 for state in ("cold", "from the cache")
             }
     return times
-
-
-def _child(
-    what: str, name: str, size: tuple[int, int], environment: dict[str, str] | None = None
-) -> dict[str, float]:
-    """Measure ``what`` in a process of its own."""
-    command = [sys.executable, "-m", "benchmarks.speed", what, name, *map(str, size)]
-    done = subprocess.run(
-        command,
-        env=os.environ | (environment or {}),
-        cwd=Path(__file__).parent.parent,
-        stdout=subprocess.PIPE,
-        check=True,
-    )
-    figures: dict[str, float] = json.loads(done.stdout)
-    return figures
 
 
 def _measure(what: str, name: str, size: tuple[int, int]) -> dict[str, float]:
@@ -239,13 +223,18 @@ def _measure(what: str, name: str, size: tuple[int, int]) -> dict[str, float]:
         return {"seconds": time.perf_counter() - start}
     # Imports, thread pools and compilation are not the metric's working memory.
     _once(name, contender, *images((96, 160)))
+    return {"megabytes": peak_megabytes(lambda: _once(name, contender, test, reference))}
+
+
+def peak_megabytes(call: Callable[[], object]) -> float:
+    """Return the memory that a call takes at most over what the process had before, in MB."""
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-    before = status("VmRSS")
-    _once(name, contender, test, reference)
-    return {"megabytes": (status("VmHWM") - before) / 1e3}
+    before = _status("VmRSS")
+    call()
+    return (_status("VmHWM") - before) / 1e3
 
 
-def status(field: str) -> float:
+def _status(field: str) -> float:
     """Return a field of /proc/self/status in kilobytes."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(field):
@@ -291,11 +280,7 @@ def _table(result: dict[str, Any]) -> str:
 
 
 def _plot(result: dict[str, Any], path: Path) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.0, 3.6), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(8.0, 3.6)
     bars, curve = figure.subplots(1, 2)
     ratios = {
         name: seconds / result["forward_seconds"]["kornia SSIM"]

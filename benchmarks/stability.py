@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.exact import DIGITS, largest_error
-from benchmarks.record import caption, circumstances, save
+from benchmarks.record import blank_figure, caption, circumstances, save
 from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar, Steerable, VDMLoss
 from torch_vdm.cortex import Transform
 
@@ -209,11 +209,7 @@ def _table(result: dict[str, Any]) -> str:
 
 
 def _plot(result: dict[str, Any], path: Path) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.0, 4.2), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(8.0, 4.2)
     axis = figure.subplots()
     names = list(result["cases"])
     for precision, marker in zip(("float32", "bfloat16", "float16"), "osv", strict=True):

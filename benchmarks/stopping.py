@@ -21,7 +21,6 @@ error, times the root of their number: within 3 of 0 for an image without bias.
 import hashlib
 import json
 import math
-import os
 import statistics
 from collections.abc import Callable
 from functools import lru_cache
@@ -32,7 +31,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.record import caption, circumstances, save
+from benchmarks.curves import difference
+from benchmarks.places import CACHE
+from benchmarks.record import blank_figure, caption, circumstances, save, source
+from benchmarks.scenes import STILL_LIFE, scene_file, sized
 from sampling import Sampler, Settings, rounds
 from sampling.renderers import Renderer
 from sampling.renderers.mitsuba import MitsubaRenderer
@@ -59,8 +61,7 @@ COVERAGE, SCENE_COVERAGE, MEDIAN = 0.95, 0.85, (0.7, 0.95)
 FIRST_SEED = 1001
 REFERENCE_SEEDS, REFERENCE_TOLERANCE = (1_000_001, 1_000_002), 0.25
 
-ROOT = Path(__file__).resolve().parent.parent
-REFERENCES = ROOT / "benchmarks" / "cache" / "stopping"
+REFERENCES = CACHE / "stopping"
 
 
 class Table(NamedTuple):
@@ -111,7 +112,7 @@ def full_tables() -> list[Table]:
     """Return what the committed result is made of."""
     calibrated, paper = Observer.calibrated(), Observer.paper()
     every, cheap = tuple(SCENES), ("bright beside dark", "coloured event")
-    found = tuple(name for name in RENDERED if _scene_file(name).is_file())
+    found = tuple(name for name, (file, _) in RENDERED.items() if scene_file(file).is_file())
     return [
         Table("64x64, 2 JND", 64, 2.0, calibrated, 20, every),
         Table("Mitsuba, 64x64, 2 JND", 64, 2.0, calibrated, 20, found),
@@ -235,15 +236,14 @@ SCENES: dict[str, Scene] = {
     "dark, 1 in 1000": dark_rare,
 }
 
-# Scenes of Mitsuba: the file, below the project or, for those that others lent, below the folder
-# of shared data, and what makes them square. Left out are those whose references or runs need
-# minutes: glass, plates with lights of 1:10^4, a tiny light and its caustic, fog, lights out of
-# focus.
-RENDERED: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
-    "still life": ("sampling/scenes/still_life.xml", ("width", "height"), {}),
-    "Cornell box": ("scenes/cbox/scene.xml", ("res",), {"max_depth": "4"}),
-    "chequered plane": ("scenes/checker_horizon.xml", ("resx", "resy"), {}),
-    "textured wall": ("scenes/textured_wall.xml", ("resx", "resy"), {}),
+# Scenes of Mitsuba: the file, and parameters beside the size. Left out are those whose references
+# or runs need minutes: glass, plates with lights of 1:10^4, a tiny light and its caustic, fog,
+# lights out of focus.
+RENDERED: dict[str, tuple[str, dict[str, str]]] = {
+    "still life": (STILL_LIFE, {}),
+    "Cornell box": ("cbox/scene.xml", {"max_depth": "4"}),
+    "chequered plane": ("checker_horizon.xml", {}),
+    "textured wall": ("textured_wall.xml", {}),
 }
 
 
@@ -251,27 +251,17 @@ def _grey(value: Plane) -> Plane:
     return np.repeat(value[..., None], 3, -1)
 
 
-def _scene_file(name: str) -> Path:
-    """Return where a scene of Mitsuba is looked for."""
-    file = RENDERED[name][0]
-    lent = Path(os.environ.get("TORCH_VDM_DATA", ROOT.parent / "shared" / "data"))
-    return (lent if file.startswith("scenes/") else ROOT) / file
-
-
 def _renderer(name: str, side: int, seed: int) -> Renderer:
     """Return a scene with one seed's samples."""
     if name in SCENES:
         return make_scene(name, side, seed)
-    _, sides, others = RENDERED[name]
-    parameters = {**dict.fromkeys(sides, str(side)), **others}
-    return MitsubaRenderer(_scene_file(name), parameters, seed=seed)
+    file, others = RENDERED[name]
+    return MitsubaRenderer(scene_file(file), {**sized(file, side), **others}, seed=seed)
 
 
 def _jnd(metric: VDM, one: Plane, other: Plane) -> float:
     """Return the largest visible difference between two images, (H, W, 3)."""
-    images = [torch.from_numpy(np.moveaxis(plane, -1, 0)[None].copy()) for plane in (one, other)]
-    with torch.no_grad():
-        return float(metric(*images).max())
+    return float(difference(metric, one, other).max())
 
 
 @lru_cache
@@ -303,15 +293,11 @@ def _truth(name: str, side: int, tolerance: float, observer: Observer) -> Truth:
 
 def _resumed(partial: Path | None) -> dict[str, Any]:
     """Return the runs that the same code has done before it was interrupted."""
-    code = hashlib.sha256()
-    for folder in ("torch_vdm", "sampling"):
-        for path in sorted((ROOT / folder).rglob("*.py")):
-            code.update(path.read_bytes())
     before: dict[str, Any] = {}
     if partial is not None and partial.is_file():
         before = json.loads(partial.read_text())
-    same = before.get("code") == code.hexdigest()
-    return before if same else {"code": code.hexdigest(), "runs": {}}
+    code = source()
+    return before if before.get("code") == code else {"code": code, "runs": {}}
 
 
 def _measured(table: Table, done: dict[str, Any], partial: Path | None) -> dict[str, Any]:
@@ -462,12 +448,9 @@ def _verdict(table: dict[str, Any]) -> str:
 
 def _plot(result: dict[str, Any], path: Path) -> None:
     from matplotlib import colormaps
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
     tables = result["tables"]
-    figure = Figure(figsize=(9.0, 0.9 + 0.9 * len(tables)), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(9.0, 0.9 + 0.9 * len(tables))
     axis = figure.subplots()
     names = [*SCENES, *RENDERED]
     colours = colormaps["tab20"](range(len(names)))

@@ -23,10 +23,12 @@ from torch import Tensor
 
 from benchmarks import pixels, renders, unet
 from benchmarks.judges import MORE_IS_BETTER, PPD, WHITE, cvvdp_metric, judges
-from benchmarks.record import caption, circumstances, save
-from benchmarks.renders import CACHE, Picture, held_out_scenes, picture, training_scenes
+from benchmarks.places import CACHE
+from benchmarks.record import blank_figure, caption, circumstances, save
+from benchmarks.renders import Picture, held_out_scenes, picture, training_scenes
 from torch_vdm import VDM, Display, VDMLoss
 from torch_vdm.display import encode_srgb
+from torch_vdm.io import atomic_path
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 
@@ -151,9 +153,8 @@ def trained(
     kept = cache / f"{name}_{seed}_{key}.pt"
     if not kept.exists():
         network = unet.train(loss, pictures, seed, steps)
-        with tempfile.NamedTemporaryFile(dir=cache, suffix=".pt", delete=False) as file:
-            torch.save(network.state_dict(), file)
-        Path(file.name).replace(kept)
+        with atomic_path(kept) as temporary:
+            torch.save(network.state_dict(), temporary)
     network = unet.UNet()
     network.load_state_dict(torch.load(kept, weights_only=True))
     return network.eval()
@@ -314,15 +315,11 @@ def _verdict(result: dict[str, Any], figures: Sequence[str]) -> str:
 
 def _plot(shown: Picture, networks: Mapping[str, unet.UNet], path: Path) -> None:
     """Draw a held-out picture by each network, and its map of JND beneath."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     reference = shown.reference[None]
     images = {"noisy": shown.noisy[:1, :3]}
     images |= {name: unet.denoise(each, shown.noisy[:1]) for name, each in networks.items()}
     metric = VDM(PPD, Display.linear(WHITE))
-    figure = Figure(figsize=(2.3 * (len(images) + 1), 5.1), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(2.3 * (len(images) + 1), 5.1)
     axes: Any = figure.subplots(2, len(images) + 1)
     for axis in axes.flat:
         axis.set_axis_off()

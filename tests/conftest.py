@@ -1,7 +1,6 @@
 """Where test data lives, what images tests are made of, and the reference's observer."""
 
 import dataclasses
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ import torch
 from hypothesis import settings
 from numpy.typing import NDArray
 
+from benchmarks import places
 from tests.reference import calibrated
 from torch_vdm import Observer
 
@@ -19,13 +19,11 @@ settings.load_profile("default")
 # The images of tests are small: threads would wait for each other longer than they compute.
 torch.set_num_threads(1)
 
-ROOT = Path(__file__).resolve().parent.parent
-
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Return the folder of shared data; a test that needs it is skipped where it is missing."""
-    folder = Path(os.environ.get("TORCH_VDM_DATA", ROOT.parent / "shared" / "data"))
+    folder = places.shared_data()
     if not folder.is_dir():
         pytest.skip(f"no shared data at {folder}: set TORCH_VDM_DATA to its folder")
     return folder

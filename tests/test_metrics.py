@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.conftest import ROOT
+from benchmarks.places import ROOT
 from torch_vdm import VDM
 from torch_vdm.metrics import VisualDifference
 

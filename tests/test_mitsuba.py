@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.places import ROOT
 from sampling.renderers import Samples, llvm
 from sampling.renderers.llvm import LLVMError, find_llvm
 from sampling.renderers.mitsuba import MitsubaRenderer, SceneError, load_mitsuba
-from tests.conftest import ROOT
 
 # A lens, a shutter, fog and a window cut out of the picture, in one scene.
 FOG = """

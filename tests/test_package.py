@@ -5,7 +5,7 @@ import sys
 import tomllib
 
 import torch_vdm
-from tests.conftest import ROOT
+from benchmarks.places import ROOT
 
 
 def test_heavy_packages_are_imported_where_they_are_used() -> None:

@@ -16,11 +16,11 @@ import OpenEXR
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.places import ROOT
 from sampling import Samples, cli
 from sampling.cli import main
 from sampling.renderers.llvm import LLVMError, find_llvm
 from sampling.renderers.mitsuba import MitsubaRenderer, SceneError, load_mitsuba
-from tests.conftest import ROOT
 from torch_vdm.io import load
 
 # FACE.md: what acceptance reads.
