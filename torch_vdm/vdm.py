@@ -482,18 +482,22 @@ class VDM(TiledMetric):
             return []
         sizes = [_size(detail) for detail in first.details[:few]]
         nodes = [math.prod(size) for size in sizes]
-        details, parents = [], []
-        for cortex in (first, second):
-            details.append(_in_a_row(cortex.details[:few]))
-            lowpass = (cortex.parent_lowpass(number) for number in range(few))
-            pushed = [push(plane, size) for plane, size in zip(lowpass, sizes, strict=True)]
-            parents.append(_in_a_row(pushed))
-        sights = self._sights(levels.in_a_row(nodes), constants, parents)
-        difference = _response_difference(
+        details = [_in_a_row(cortex.details[:few]) for cortex in (first, second)]
+        # Both images in one batch, where nothing is computed.
+        parents = _in_a_row(
+            push(torch.cat([cortex.parent_lowpass(number) for cortex in (first, second)]), size)
+            for number, size in enumerate(sizes)
+        )
+        fast = self._fast and details[0].numel() >= SMALLEST
+        one, other = (parent.clone() for parent in parents.chunk(2))
+        sights = self._sights(levels.in_a_row(nodes), constants, (one, other), fast)
+        respond = compiled(_response_difference) if fast else _response_difference
+        difference = respond(
             details[0], details[1], sights[0], sights[1], *self._options(constants)
         )
-        exponent = constants["summation_exponent"]
-        return [self._gathered(plane, exponent) for plane in _planes(difference, sizes)]
+        pooled = [self._pooled(plane) for plane in _planes(difference, sizes)]
+        local = self._summed(_in_a_row(pooled), constants["summation_exponent"])
+        return _planes(local, [_size(plane) for plane in pooled])
 
     def _local_difference(
         self,
@@ -548,19 +552,35 @@ class VDM(TiledMetric):
 
     def _gathered(self, difference: Tensor, exponent: Tensor, fast: bool = False) -> Tensor:
         """Return the local visual difference of response differences, after spatial pooling."""
+        if not fast:
+            return self._summed(self._pooled(difference), exponent)
+        local: Tensor
         if self.transform.shifts == 1:
             if not self.effects.pooling:
                 return local_visual_difference(difference, exponent)
-            gather = compiled(_pooled_difference) if fast else _pooled_difference
-            local: Tensor = gather(surround(difference), exponent)
+            local = compiled(_pooled_difference)(surround(difference), exponent)
             return local
         nodes = 3 if self.effects.pooling else 1
-        energy = compiled(phase_energy) if fast else phase_energy
-        rows = compiled(pool_halves) if fast else pool_halves
-        columns = compiled(_pooled_energy) if fast else _pooled_energy
-        surrounded = surround_halves(energy(difference, self.transform.phases), nodes)
-        local = columns(rows(surrounded, nodes, -1), nodes, exponent)
-        return local  # noqa: RET504  # for its type
+        surrounded = surround_halves(
+            compiled(phase_energy)(difference, self.transform.phases), nodes
+        )
+        rows = compiled(pool_halves)(surrounded, nodes, -1)
+        local = compiled(_pooled_energy)(rows, nodes, exponent)
+        return local
+
+    def _pooled(self, difference: Tensor) -> Tensor:
+        """Return response differences after spatial pooling, as `_summed` takes them."""
+        if self.transform.shifts == 1:
+            return pool(surround(difference)) if self.effects.pooling else difference
+        nodes = 3 if self.effects.pooling else 1
+        surrounded = surround_halves(phase_energy(difference, self.transform.phases), nodes)
+        return pool_halves(pool_halves(surrounded, nodes, -1), nodes, -2)
+
+    def _summed(self, pooled: Tensor, exponent: Tensor) -> Tensor:
+        """Return the local visual difference of pooled response differences."""
+        if self.transform.shifts == 1:
+            return local_visual_difference(pooled, exponent)
+        return local_visual_difference_of_energy(pooled, exponent)
 
     def _sights(
         self,
@@ -572,9 +592,10 @@ class VDM(TiledMetric):
         """Return the sight of a level for each image, at the parents, whose lowpass is given."""
         if self.transform.csf == "filter":
             return [Sight(None, (1.0 / level.gain)[None, None])] * len(parents)
-        look = compiled(_sight) if fast else _sight
+        look = compiled(_sights_of) if fast else _sights_of
         local = self.observer.adaptation_luminance is None
-        return [look(parent, level, constants, local, self.effects.chromatic) for parent in parents]
+        sights: list[Sight] = look(parents, level, constants, local, self.effects.chromatic)
+        return sights
 
     def _levels(self, finest: int, count: int, constants: dict[str, Tensor]) -> Levels:
         """Return what ``count`` levels respond to, from the level ``finest``; the coarsest first.
@@ -675,6 +696,17 @@ def _response_difference(
         other_details, other_sight, *options
     )
     return difference.abs() if signed else difference
+
+
+def _sights_of(
+    parents: Sequence[Tensor],
+    level: Level,
+    constants: dict[str, Tensor],
+    local: bool,
+    chromatic: bool,
+) -> list[Sight]:
+    """Return `_sight` at each of ``parents``."""
+    return [_sight(parent, level, constants, local, chromatic) for parent in parents]
 
 
 def _sight(
