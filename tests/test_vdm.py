@@ -263,8 +263,14 @@ def test_effects_that_are_off_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> N
     def forbidden(*_: object) -> None:
         pytest.fail("an effect that is off was computed")
 
-    for name in ("attenuation", "butterworth", "signed_transducer", "surround"):
-        monkeypatch.setattr(f"torch_vdm.vdm.{name}", forbidden)
+    for name in (
+        "vdm.attenuation",
+        "vdm.butterworth",
+        "vdm.surround",
+        "response.signed_transducer",
+        "gradient.surround",
+    ):
+        monkeypatch.setattr(f"torch_vdm.{name}", forbidden)
     VDM(effects=Effects(False, False, False, False))(*images())
 
 

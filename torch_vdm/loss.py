@@ -49,8 +49,8 @@ class VDMLoss(nn.Module):
     reduction
         Over the batch: "mean", "sum", or "none" for one value an item, (B,).
     checkpoint
-        Whether to keep little for the backward pass and compute the rest again there: about a
-        third less memory for a third more time, with the same gradients. Not with `torch.func`.
+        Whether to keep less for the backward pass and compute it again there: about a third less
+        memory for a quarter more time, with the same gradients. Not with `torch.func`.
 
     Raises
     ------
@@ -87,7 +87,7 @@ class VDMLoss(nn.Module):
         """
         test, reference, seen = self.metric._checked(test, reference)
         # The L1 term first: what it needs on the way is gone when the metric needs most.
-        l1 = self.l1 * self.metric._kept(self._absolute, test, reference) if self.l1 else 0.0
+        l1 = self.l1 * self.metric._in_rows(self._absolute, test, reference) if self.l1 else 0.0
         plane = torch.log1p(self.metric._power(test, reference, seen)) + l1
         items = _mean(plane, mask)
         if self.reduction == "mean":

@@ -5,7 +5,7 @@ from torch import Tensor
 
 
 def mix(matrix: Tensor, planes: Tensor) -> Tensor:
-    """Return the three channels of ``planes`` mixed by ``matrix``.
+    """Return the channels of ``planes`` mixed by ``matrix``.
 
     Written as multiplications and additions: a matrix product would run in bfloat16 under
     autocast and in TF32 where a user allows it, and its last bits may depend on alignment, so
@@ -14,20 +14,22 @@ def mix(matrix: Tensor, planes: Tensor) -> Tensor:
     Parameters
     ----------
     matrix
-        (N, 3); N rows are N output channels.
+        (N, C); N rows are N output channels.
     planes
-        (B, 3, ...).
+        (B, C, ...), C of 1 or more.
 
     Returns
     -------
     Tensor
         (B, N, ...).
     """
-    first, second, third = planes.unbind(1)
+    first, *others = planes.unbind(1)
     rows = []
     for row in matrix:
-        mixed = torch.addcmul(first * row[0], second, row[1])
-        rows.append(torch.addcmul(mixed, third, row[2]))
+        mixed = first * row[0]
+        for number, plane in enumerate(others, 1):
+            mixed = torch.addcmul(mixed, plane, row[number])
+        rows.append(mixed)
     return torch.stack(rows, 1)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -32,6 +33,10 @@ class Source(Protocol):
 
 
 Slices = tuple[slice, slice]
+
+
+def _ends(side: slice) -> tuple[int, int]:
+    return side.start, side.stop
 
 
 class Tile(NamedTuple):
@@ -112,6 +117,17 @@ class Tiling:
         # No thinner than so many halos, which are computed twice.
         rows = max(pixels // (size[1] * parent) * parent, 4 * halo)
         return cls(size, (rows, size[1]), levels, halo)
+
+    def split_rows(self, image: Tensor) -> Iterator[Tensor]:
+        """Yield what each strip is computed with, of an image (B, C, H, W).
+
+        Cut once and put together again, so that a gradient comes back in one piece.
+        """
+        edges = sorted({edge for strip in self for edge in _ends(strip.around[0])})
+        parts = image.split([end - begin for begin, end in pairwise(edges)], -2)
+        for strip in self:
+            first, last = (edges.index(edge) for edge in _ends(strip.around[0]))
+            yield torch.cat(parts[first:last], -2)
 
     @property
     def whole(self) -> bool:

@@ -1,8 +1,8 @@
 """The visual difference metric: the stages of Fig. 2, in order. Only this file knows the order."""
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple, Self
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from torch_vdm.contrast import (
 )
 from torch_vdm.cortex import DEEPEST, Cortex, Haar, Transform, bands
 from torch_vdm.cortex.transform import Base, mean_of
-from torch_vdm.csf import bandpass, barten, butterworth
+from torch_vdm.csf import barten, butterworth
 from torch_vdm.display import BT709_TO_XYZ, Display
 from torch_vdm.distance import (
     accumulate,
@@ -28,15 +28,25 @@ from torch_vdm.distance import (
 )
 from torch_vdm.effects import Effects
 from torch_vdm.fast import SMALLEST, compiled, step
-from torch_vdm.masking import energy_transducer, signed_transducer
-from torch_vdm.matrix import mix, product
+from torch_vdm.gradient import by_hand, local_difference
+from torch_vdm.matrix import product
 from torch_vdm.observer import Observer
 from torch_vdm.pair import Nonfinite
 from torch_vdm.pooling import glance, phase_energy, pool, pool_halves, surround, surround_halves
 from torch_vdm.quadtree import push
+from torch_vdm.response import (
+    Level,
+    Levels,
+    Sight,
+    adapted_luminance,
+    response,
+    response_difference,
+    sensitivity_at,
+    sights_of,
+)
 from torch_vdm.sarnoff import Sarnoff
 from torch_vdm.tiled import TiledMetric
-from torch_vdm.tiling import Tiling, cut
+from torch_vdm.tiling import Tile, Tiling, cut
 
 # Planes with more numbers are computed in parts. Status: choice, measured.
 LARGEST_AT_ONCE = 2**18
@@ -59,73 +69,6 @@ LARGEST_SCORED = 0.2
 
 # A Butterworth filter's parameters.
 FILTER = ("gain", "cutoff", "order")
-
-
-class Level(NamedTuple):
-    """What a level of the transform responds to, as far as it does not depend on the image.
-
-    For planes (h, w) of one level the last two sides are 1 and 1; for the nodes of several levels
-    in a row, they are 1 and as many. Where there are as many as orientations, one stands for all
-    where all have the same.
-    """
-
-    passed: Tensor
-    """(3, 1, 1): the share of each cone's details that chromatic aberration leaves."""
-    frequency: Tensor
-    """(as many, 1, 1), in cycles/degree: the frequency of the best response."""
-    gain: Tensor
-    """(as many, 1, 1): what contrast is divided by."""
-    sensitivity: Tensor
-    """(channels, as many, 1, 1): the contrast sensitivity, over the gain. Where the luminance is
-    local, that of C1 and C2 in bright light."""
-
-
-class Levels(NamedTuple):
-    """The same of all levels of an image, level 0 first, without the last two sides."""
-
-    passed: Tensor
-    """(levels, 3)."""
-    frequency: Tensor
-    """(levels, as many)."""
-    gain: Tensor
-    """(levels, as many)."""
-    sensitivity: Tensor
-    """(levels, channels, as many)."""
-
-    def only(self, number: int) -> Level:
-        """Return one level."""
-        # Copies, for compiled code is specialised on the offset of a view.
-        return Level(*(part[number, ..., None, None].clone() for part in self))
-
-    def in_a_row(self, nodes: Sequence[int]) -> Level:
-        """Return the coarsest levels as one, whose plane is the ``nodes`` of each in a row."""
-        # For each node its level; the size is given so that nothing is read back from the device.
-        counts = torch.tensor(nodes, device=self.passed.device)
-        which = torch.repeat_interleave(counts, output_size=sum(nodes))
-        return Level(*(part[which].movedim(0, -1).unsqueeze(-2) for part in self))
-
-
-class Sight(NamedTuple):
-    """What turns the details of an image at a level into contrasts and weights them."""
-
-    scale: Tensor | None
-    """(B, 3, h, w): for each cone the share that chromatic aberration leaves, over what the
-    parent is adapted to. None where the details are weighted contrast already."""
-    sensitivity: Tensor
-    """(B, channels, orientations, h, w): the contrast sensitivity of each channel, or one
-    orientation or node of it where all have the same."""
-
-    def pushed(self, size: tuple[int, int]) -> "Sight":
-        """Return what is given at the parents at their children, on a plane of ``size``."""
-        shared = self.sensitivity.shape[-2:] == (1, 1)
-        sensitivity = self.sensitivity if shared else push(self.sensitivity, size)
-        return Sight(None if self.scale is None else push(self.scale, size), sensitivity)
-
-    def of(self, orientations: slice) -> "Sight":
-        """Return the sight of some orientations."""
-        if self.sensitivity.shape[2] == 1:
-            return self
-        return Sight(self.scale, self.sensitivity[:, :, orientations])
 
 
 class VDM(TiledMetric):
@@ -225,10 +168,13 @@ class VDM(TiledMetric):
         )
 
     def _accumulated(self, test: Tensor, reference: Tensor) -> Tensor:
-        # Gradients need all that strips drop.
+        # Gradients need what strips drop, unless it is computed again.
         graph = torch.is_grad_enabled() and (test.requires_grad or reference.requires_grad)
-        if not (graph or torch.compiler.is_compiling()) and (
-            self.transform == Haar() and math.prod(_size(test)) >= 2 * STRIP
+        if (
+            self.transform == Haar()
+            and math.prod(_size(test)) >= 2 * STRIP
+            and not torch.compiler.is_compiling()
+            and (self._checkpointed or not graph)
         ):
             return self._accumulated_in_strips(test, reference, self.transform)
         return self.compare(self.represent(test), self.represent(reference))
@@ -244,32 +190,41 @@ class VDM(TiledMetric):
         constants = self._constants(test.dtype)
         # One level more than are computed, for the parents of the last.
         levels = self._levels(0, octaves + 1, constants)
-        # For each level, coarser first, what its nodes have in each strip.
-        fine: list[list[Tensor]] = [[] for _ in range(octaves)]
-        # For each image, the means of nodes of 2^octaves pixels, and those of rows.
-        means: tuple[list[Tensor], list[Tensor]] = [], []
-        means_of_rows: tuple[list[Tensor], list[Tensor]] = [], []
-        for strip in Tiling.strips(size, STRIP, octaves, haar.reach + 1):
+        tiling = Tiling.strips(size, STRIP, octaves, haar.reach + 1)
+
+        def strip_of(strip: Tile, one: Tensor, other: Tensor) -> list[Tensor]:
+            """Return the means of nodes and rows of two images, and what their levels add."""
+            parts: list[Tensor] = []
             strips: list[Cortex] = []
-            for number, image in enumerate((test, reference)):
-                cones = self._cone_planes(cut(image, strip.around))
+            for image in (one, other):
+                cones = self._cone_planes(image)
                 cortex = haar.begin(cones, octaves + 1, *options)
-                means[number].append(cut(cortex.lowpass[1], strip.within(2**octaves)))
-                means_of_rows[number].append(cut(cones, strip.within(1)).mean(-1, keepdim=True))
+                rows = cones.mean(-1, keepdim=True)
+                parts.append(cut(cortex.lowpass[1], strip.within(2**octaves)))
+                parts.append(cut(rows, (strip.within(1)[0], slice(None))))
                 strips.append(cortex)
             for number in range(1, octaves + 1):
                 level = levels.only(number)
                 local = self._local_difference(strips[0], strips[1], number, level, constants)
                 node = 2 ** (octaves + 1 - number)
-                fine[number - 1].append(cut(local, strip.within(node)))
-        first, second = (
-            haar.coarser(
-                Base(torch.cat(parts, -2), octaves, size, mean_of(torch.cat(rows, -2))), *options
+                parts.append(cut(local, strip.within(node)))
+            return parts
+
+        pieces = [
+            strip_of(strip, *around)
+            for strip, *around in zip(
+                tiling, *(tiling.split_rows(image) for image in (test, reference)), strict=True
             )
-            for parts, rows in zip(means, means_of_rows, strict=True)
+        ]
+        first_means, first_rows, second_means, second_rows, *fine = (
+            torch.cat(parts, -2) for parts in zip(*pieces, strict=True)
+        )
+        first, second = (
+            haar.coarser(Base(means, octaves, size, mean_of(rows)), *options)
+            for means, rows in ((first_means, first_rows), (second_means, second_rows))
         )
         coarse, root = self._differences(first, second)
-        return accumulate([*coarse, *(torch.cat(planes, -2) for planes in fine)], root)
+        return accumulate([*coarse, *fine], root)
 
     def _to_pixels(self, plane: Tensor, size: tuple[int, int]) -> Tensor:
         # The leaves of overlapping nodes are the pixels.
@@ -347,8 +302,13 @@ class VDM(TiledMetric):
         if self._fast:
             planes: Tensor = compiled(_light)(image, *around)
             return planes
-        rows = max(1, LARGEST_AT_ONCE * image.shape[-2] // image.numel())
-        return torch.cat([self._kept(_light, part, *around) for part in image.split(rows, -2)], -2)
+        return self._in_rows(lambda part: _light(part, *around), image)
+
+    def _in_rows(self, function: Callable[..., Tensor], *images: Tensor) -> Tensor:
+        """Return a function of pixels, a few rows at a time, which stay in the cache."""
+        rows = max(1, LARGEST_AT_ONCE * images[0].shape[-2] // images[0].numel())
+        parts = zip(*(image.split(rows, -2) for image in images), strict=True)
+        return torch.cat([self._kept(function, *part) for part in parts], -2)
 
     def _weighted_contrast(self, planes: Tensor) -> Tensor:
         """Return the weighted contrast of A, C1, C2, 1 at threshold, of cone planes (B, 3, H, W).
@@ -407,7 +367,7 @@ class VDM(TiledMetric):
         at_bands = (part[..., None, None] for part in (ones, frequency, ones, bright))
         level = Level(*at_bands)
         chromatic = self.effects.chromatic
-        sensitivity = _sensitivity(grey[None, :, None], level, constants, chromatic)[0, :, :, 0]
+        sensitivity = sensitivity_at(grey[None, :, None], level, constants, chromatic)[0, :, :, 0]
         achromatic = (constants["band_weights"][..., None] * sensitivity[0]).sum(1)
         dim = sensitivity[-1, 0] / bright[-1, 0]
         if not chromatic:
@@ -426,7 +386,7 @@ class VDM(TiledMetric):
             level, parent = levels.only(number), cortex.parent_lowpass(number)
             (sight,) = self._sights(level, constants, [parent])
             responses.append(
-                _response(detail, sight.pushed(_size(detail)), *self._options(constants))
+                response(detail, sight.pushed(_size(detail)), *self._options(constants))
             )
         return tuple(responses)
 
@@ -491,7 +451,7 @@ class VDM(TiledMetric):
         fast = self._fast and details[0].numel() >= SMALLEST
         one, other = (parent.clone() for parent in parents.chunk(2))
         sights = self._sights(levels.in_a_row(nodes), constants, (one, other), fast)
-        respond = compiled(_response_difference) if fast else _response_difference
+        respond = compiled(response_difference) if fast else response_difference
         difference = respond(
             details[0], details[1], sights[0], sights[1], *self._options(constants)
         )
@@ -515,29 +475,38 @@ class VDM(TiledMetric):
             sight.pushed(_size(details)) for sight in self._sights(level, constants, parents, fast)
         )
         orientations = details.shape[2]
-        respond = compiled(_response_difference) if fast else _response_difference
+        respond = compiled(response_difference) if fast else response_difference
         # One orientation at a time where the planes are large: what is computed on the way then
         # stays in the processor's cache. Compiled code keeps nothing on the way.
         at_once = orientations
         if not fast and details.numel() > LARGEST_AT_ONCE:
             at_once = self.transform.phases
 
-        def gathered(*arguments: Any) -> Tensor:
-            difference = respond(*arguments)
-            return self._gathered(difference, constants["summation_exponent"], fast)
+        exponent, options = constants["summation_exponent"], self._options(constants)
 
+        def gathered(one: Tensor, other: Tensor, sight: Sight, other_sight: Sight) -> Tensor:
+            difference = respond(one, other, sight, other_sight, *options)
+            return self._gathered(difference, exponent, fast)
+
+        # Where the gradient is known by hand, nothing needs to be kept.
+        known = (
+            self.observer.signed
+            and self.effects.masking
+            and self.effects.pooling
+            and self.transform.csf == "levels"
+            and self.transform.shifts == self.transform.phases == 1
+            and not fast
+        )
         local = []
-        for plane in range(0, orientations, at_once):
-            some = slice(plane, plane + at_once)
-            arguments = (
-                details[:, :, some],
-                others[:, :, some],
-                sight.of(some),
-                other_sight.of(some),
-                *self._options(constants),
-            )
-
-            local.append(self._kept(gathered, *arguments))
+        planes = zip(details.split(at_once, 2), others.split(at_once, 2), strict=True)
+        for number, (one, other) in enumerate(planes):
+            some = slice(number * at_once, (number + 1) * at_once)
+            arguments = one, other, sight.of(some), other_sight.of(some)
+            if known and by_hand():
+                matrix, masking = options[:2]
+                local.append(local_difference(gathered, *arguments, matrix, masking, exponent))
+            else:
+                local.append(self._kept(gathered, *arguments))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]
 
     def _options(self, constants: dict[str, Tensor]) -> tuple[Tensor, Tensor, bool, bool, int]:
@@ -592,7 +561,7 @@ class VDM(TiledMetric):
         """Return the sight of a level for each image, at the parents, whose lowpass is given."""
         if self.transform.csf == "filter":
             return [Sight(None, (1.0 / level.gain)[None, None])] * len(parents)
-        look = compiled(_sights_of) if fast else _sights_of
+        look = compiled(sights_of) if fast else sights_of
         local = self.observer.adaptation_luminance is None
         sights: list[Sight] = look(parents, level, constants, local, self.effects.chromatic)
         return sights
@@ -656,104 +625,12 @@ def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) ->
     return display.to_xyz(image, product(cones, primaries))
 
 
-def _response(
-    details: Tensor,
-    sight: Sight,
-    matrix: Tensor,
-    exponent: Tensor,
-    signed: bool,
-    masking: bool,
-    phases: int,
-) -> Tensor:
-    """Return the responses of one level of one image: local contrast to the transducer."""
-    contrast = details
-    if sight.scale is not None:
-        contrast = opponents(local_contrast(details, sight.scale), matrix)
-    weighted = contrast * sight.sensitivity
-    if signed:
-        return signed_transducer(weighted, exponent, phases) if masking else weighted
-    return energy_transducer(weighted * weighted) if masking else weighted.abs()
-
-
-def _response_difference(
-    details: Tensor,
-    other_details: Tensor,
-    sight: Sight,
-    other_sight: Sight,
-    matrix: Tensor,
-    exponent: Tensor,
-    signed: bool,
-    masking: bool,
-    phases: int,
-) -> Tensor:
-    """Return the difference of two images' responses at a level, absolute where they are signed.
-
-    Each image by itself: equal images then take equal paths through the vectorised loops, and
-    their difference is exactly 0.
-    """
-    options = matrix, exponent, signed, masking, phases
-    difference = _response(details, sight, *options) - _response(
-        other_details, other_sight, *options
-    )
-    return difference.abs() if signed else difference
-
-
-def _sights_of(
-    parents: Sequence[Tensor],
-    level: Level,
-    constants: dict[str, Tensor],
-    local: bool,
-    chromatic: bool,
-) -> list[Sight]:
-    """Return `_sight` at each of ``parents``."""
-    return [_sight(parent, level, constants, local, chromatic) for parent in parents]
-
-
-def _sight(
-    parent: Tensor, level: Level, constants: dict[str, Tensor], local: bool, chromatic: bool
-) -> Sight:
-    """Return the sight of a level at its parents, of which there are fewer than nodes.
-
-    ``parent`` is their lowpass (B, 3, h, w); ``local``: in the local luminance.
-    """
-    scale = level.passed / adapted(parent, constants["dark_cones"])
-    if not local:
-        return Sight(scale, level.sensitivity.unsqueeze(0))
-    return Sight(scale, _sensitivity(parent, level, constants, chromatic))
-
-
-def _luminance(lowpass: Tensor, constants: dict[str, Tensor]) -> Tensor:
-    """Return the luminance (B, 1, h, w) that the eye is adapted to, cd/m2, its own light in it."""
-    seen = mix(constants["luminance_of_cones"], lowpass).clamp_min(0.0)
-    return seen + constants["dark_light"]
-
-
-def _sensitivity(
-    parent: Tensor, level: Level, constants: dict[str, Tensor], chromatic: bool
-) -> Tensor:
-    """Return the contrast sensitivity in the local luminance, at the parents."""
-    luminance = _luminance(parent, constants).unsqueeze(2)
-    dark = torch.log2(1.0 + constants["dim_luminance"] / luminance)
-    glare = torch.log2(1.0 + luminance / constants["glare_luminance"])
-    faint = torch.log2(1.0 + constants["peak_luminance"] / luminance)
-    relative = torch.log2(level.frequency / constants["peak_frequency"])
-    octaves = relative + constants["peak_exponent"] * faint
-    dimmed = constants["achromatic_dimming"] * dark + constants["glare_exponent"] * glare
-    shape = bandpass(octaves, constants["band_width"], constants["band_floor"])
-    gain = constants["achromatic_gain"] / level.gain
-    achromatic = gain * shape * torch.exp2(-dimmed)
-    if not chromatic:
-        return achromatic
-    dim = torch.exp2(-constants["chromatic_dimming"] * dark)
-    return torch.cat((achromatic, level.sensitivity * dim), 1)
-
-
 def _band_sensitivity(lowpass: Tensor, table: Tensor, constants: dict[str, Tensor]) -> Tensor:
     """Return the rows of a table at the local luminance, (B, rows, h, w).
 
     ``lowpass`` is (B, 3, h, w); ``table`` is at `LUMINANCES`, and between them linear.
     """
-    seen = _luminance(lowpass, constants)
+    seen = adapted_luminance(lowpass, constants)
     last = len(LUMINANCES) - 1
     place = (torch.log2(seen[:, 0]) - LUMINANCES[0]).clamp(0.0, last)
     low = place.detach().floor().clamp_max(last - 1.0)

@@ -1,0 +1,111 @@
+"""The gradient that is worked out by hand, against autograd's."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from torch_vdm import VDM, Display, Effects, VDMLoss, vdm
+
+
+@pytest.fixture(autouse=True)
+def level_by_level(monkeypatch: pytest.MonkeyPatch) -> None:
+    # As a large image is: small levels are autograd's.
+    monkeypatch.setattr(vdm, "FEW_NODES", 1)
+    monkeypatch.setattr(vdm, "LARGEST_AT_ONCE", 500)
+
+
+def gradients(
+    metric: VDM, images: tuple[Tensor, Tensor], wanted: tuple[bool, bool]
+) -> list[Tensor | None]:
+    leaves = [
+        image.clone().requires_grad_(want) for image, want in zip(images, wanted, strict=True)
+    ]
+    power = metric.power(leaves[0], leaves[1])
+    weights = torch.linspace(0.5, 2.0, power.numel(), dtype=power.dtype).view_as(power)
+    (power * weights).sum().backward()
+    return [leaf.grad for leaf in leaves]
+
+
+def noise(size: tuple[int, int], scale: float = 1.0) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(sum(size))
+    test, reference = scale * torch.rand(
+        2, 2, 3, *size, dtype=torch.float64, generator=generator
+    ) - 0.1 * (scale - 1.0)
+    return test, reference
+
+
+@pytest.mark.parametrize("wanted", [(True, False), (False, True), (True, True)])
+@pytest.mark.parametrize("size", [(2, 2), (7, 12), (33, 20)], ids=str)
+def test_is_autograds(
+    size: tuple[int, int], wanted: tuple[bool, bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours = gradients(VDM(), noise(size), wanted)
+    monkeypatch.setattr(vdm, "by_hand", lambda: False)
+    for mine, theirs in zip(ours, gradients(VDM(), noise(size), wanted), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "metric",
+    [
+        VDM(effects=Effects(chromatic=False)),
+        VDM(effects=Effects(aberration=False)),
+        VDM(30.0, Display.linear(200.0)),
+        VDM(30.0, Display.xyz()),
+    ],
+    ids=str,
+)
+def test_is_autograds_for_every_option(metric: VDM, monkeypatch: pytest.MonkeyPatch) -> None:
+    # HDR, with values below 0.
+    ours = gradients(metric, noise((12, 9), 30.0), (True, True))
+    monkeypatch.setattr(vdm, "by_hand", lambda: False)
+    for mine, theirs in zip(
+        ours, gradients(metric, noise((12, 9), 30.0), (True, True)), strict=True
+    ):
+        assert mine is not None
+        torch.testing.assert_close(mine, theirs, rtol=1e-9, atol=1e-9 * float(mine.abs().max()))
+
+
+def test_is_of_use_on_the_default_route() -> None:
+    # Else the others would compare autograd with itself.
+    test, reference = noise((33, 20))
+    graph = VDM().power(test.requires_grad_(), reference).grad_fn
+    seen, left = set(), [graph]
+    while left:
+        if (node := left.pop()) is not None and node not in seen:
+            seen.add(node)
+            left += [each for each, _ in node.next_functions]
+    assert "_LocalDifferenceBackward" in {node.name() for node in seen}
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5])
+def test_is_0_at_equality(value: float) -> None:
+    image = torch.full((1, 3, 16, 16), value)
+    for slope in gradients(VDM(), (image, image), (True, True)):
+        assert slope is not None
+        assert torch.count_nonzero(slope) == 0
+
+
+def test_can_be_differentiated_again() -> None:
+    test, reference = (image[:1, :, :4, :3] + 0.1 for image in noise((4, 3)))
+    loss = VDMLoss(20.0)
+    both = test.requires_grad_(), reference.requires_grad_()
+    assert torch.autograd.gradcheck(loss, both)
+    assert torch.autograd.gradgradcheck(loss, both)
+
+
+# Torch's own, from the first use of a forward derivative.
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:FutureWarning")
+def test_functional_transforms_take_autograds_way() -> None:
+    metric = VDM()
+    test, reference = noise((12, 9))
+
+    def total(image: Tensor) -> Tensor:
+        return metric.power(image, reference).sum()
+
+    image = test.clone().requires_grad_()
+    (plain,) = torch.autograd.grad(total(image), image)
+    torch.testing.assert_close(torch.func.grad(total)(test), plain)
+    tangent = torch.ones_like(test)
+    change = torch.func.jvp(total, (test,), (tangent,))[1]
+    torch.testing.assert_close(change, (plain * tangent).sum())

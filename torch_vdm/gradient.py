@@ -1,0 +1,174 @@
+"""The gradient of a level's local visual differences, worked out by hand.
+
+Autograd keeps some thirty planes of a level for the backward pass. Of the arguments alone all of
+them are known: here they are kept, and the rest is computed again, for less than it costs to
+store it. For the signed responses of nodes side by side.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from torch_vdm.contrast import LARGEST, local_contrast, opponents
+from torch_vdm.distance import SMALLEST_DIFFERENCE
+from torch_vdm.matrix import mix
+from torch_vdm.pooling import pool, surround
+from torch_vdm.response import Sight
+
+
+def local_difference(
+    function: Callable[[Tensor, Tensor, Sight, Sight], Tensor],
+    details: Tensor,
+    others: Tensor,
+    sight: Sight,
+    other_sight: Sight,
+    matrix: Tensor,
+    masking: Tensor,
+    summation: Tensor,
+) -> Tensor:
+    """Return ``function`` of two images, their local visual difference, with this gradient.
+
+    Parameters
+    ----------
+    function
+        From details and sights to (B, 1, h, w), as `VDM` computes it.
+    details, others, sight, other_sight
+        Of a level of two images.
+    matrix
+        (channels, 3), of Eq. 3.
+    masking, summation
+        The exponents of `signed_transducer` and of `local_visual_difference`.
+    """
+    around = function, matrix, masking, summation
+    local: Tensor = _LocalDifference.apply(*around, details, *sight, others, *other_sight)
+    return local
+
+
+def by_hand() -> bool:
+    """Return whether this gradient is of use: nothing traces or transforms the computation."""
+    return (
+        torch.is_grad_enabled()
+        and not torch.compiler.is_compiling()
+        and not torch._C._are_functorch_transforms_active()
+        and forward_ad._current_level < 0
+    )
+
+
+class _LocalDifference(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        function: Callable[..., Tensor],
+        matrix: Tensor,
+        masking: Tensor,
+        summation: Tensor,
+        *images: Tensor,
+    ) -> Tensor:
+        ctx.function, ctx.constants = function, (matrix, masking, summation)
+        ctx.save_for_backward(*images)
+        return _apply(function, images)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        images: tuple[Tensor, ...] = ctx.saved_tensors
+        wanted: tuple[bool, ...] = ctx.needs_input_grad[4:]
+        if torch.is_grad_enabled():
+            # It will be differentiated again: as autograd does it.
+            images = tuple(image.view_as(image) for image in images)
+            inputs = [image for image, want in zip(images, wanted, strict=True) if want]
+            local = _apply(ctx.function, images)
+            found = iter(torch.autograd.grad(local, inputs, gradient, create_graph=True))
+            slopes = [next(found) if want else None for want in wanted]
+        else:
+            slopes = _slopes(images, wanted, gradient, *ctx.constants)
+        return None, None, None, None, *slopes
+
+
+def _apply(function: Callable[..., Tensor], images: Sequence[Tensor]) -> Tensor:
+    details, others = images[0], images[3]
+    return function(details, others, Sight(*images[1:3]), Sight(*images[4:]))
+
+
+def _slopes(
+    images: Sequence[Tensor],
+    wanted: Sequence[bool],
+    gradient: Tensor,
+    matrix: Tensor,
+    masking: Tensor,
+    summation: Tensor,
+) -> list[Tensor | None]:
+    """Return the slopes by those of the ``images`` that are ``wanted``."""
+    wanted_of = wanted[:3], wanted[3:]
+    one, other = (
+        _respond(image, matrix, masking, any(slopes))
+        for image, slopes in zip((images[:3], images[3:]), wanted_of, strict=True)
+    )
+    slope = _by_difference(one.response.sub_(other.response), gradient, summation)
+    return [
+        *_by_image(images[:3], one, slope, matrix, wanted_of[0]),
+        *_by_image(images[3:], other, slope.neg_(), matrix, wanted_of[1]),
+    ]
+
+
+class _Path(NamedTuple):
+    """What lies between the details of an image and its responses (B, channels, ., h, w)."""
+
+    response: Tensor
+    contrast: Tensor
+    opponent: Tensor
+    slope: Tensor
+    """Of the transducer."""
+
+
+def _respond(image: Sequence[Tensor], matrix: Tensor, masking: Tensor, sloping: bool) -> _Path:
+    """Return the path of an image; the slope only where it is needed."""
+    details, scale, sensitivity = image
+    contrast = local_contrast(details, scale)
+    opponent = opponents(contrast, matrix)
+    weighted = opponent * sensitivity
+    energy = weighted.square().add_(1.0)
+    # `signed_transducer`: v g, g = 2^(q (1 - log2(1 + v^2))).
+    gain = torch.log2(energy).sub_(1.0).mul_(-masking).exp2_()
+    weighted.mul_(gain)
+    if sloping:
+        # g (1 - 2 q v^2 / (1 + v^2)).
+        gain.mul_(energy.reciprocal_().sub_(1.0).mul_(2.0 * masking).add_(1.0))
+    return _Path(weighted, contrast, opponent, gain)
+
+
+def _by_difference(difference: Tensor, gradient: Tensor, summation: Tensor) -> Tensor:
+    """Return the slope of the local visual difference by the difference of responses, signed."""
+    pooled = pool(surround(difference.abs()))
+    # That of size^e is e size^(e - 1).
+    slope = torch.log2(pooled.clamp_min(SMALLEST_DIFFERENCE)).mul_(summation - 2.0).exp2_()
+    slope.mul_(pooled).mul_(gradient.unsqueeze(2) * summation)
+    # With its repeated border the box is its own transpose.
+    return pool(surround(slope)).mul_(difference.sign_())
+
+
+def _by_image(
+    image: Sequence[Tensor],
+    path: _Path,
+    slope: Tensor,
+    matrix: Tensor,
+    wanted: Sequence[bool],
+) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    """Return the slopes by details, scale and sensitivity, of which those ``wanted`` are made.
+
+    From that by the response; takes the path's planes for its own.
+    """
+    if not any(wanted):
+        return None, None, None
+    details, scale, sensitivity = image
+    by_weighted = path.slope.mul_(slope)
+    by_sensitivity = None
+    if wanted[2]:
+        by_sensitivity = path.opponent.mul_(by_weighted).sum_to_size(sensitivity.shape)
+    by_contrast = mix(matrix.T, by_weighted.mul_(sensitivity))
+    by_contrast.mul_(path.contrast.abs_() < LARGEST)
+    by_scale = (by_contrast * details).sum(2) if wanted[1] else None
+    by_details = by_contrast.mul_(scale.unsqueeze(2)) if wanted[0] else None
+    return by_details, by_scale, by_sensitivity

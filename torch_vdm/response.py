@@ -1,0 +1,170 @@
+"""One level of an image from details to responses: Fig. 2 from the third box to the seventh."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_vdm.contrast import adapted, local_contrast, opponents
+from torch_vdm.csf import bandpass
+from torch_vdm.masking import energy_transducer, signed_transducer
+from torch_vdm.matrix import mix
+from torch_vdm.quadtree import push
+
+
+class Level(NamedTuple):
+    """What a level of the transform responds to, as far as it does not depend on the image.
+
+    For planes (h, w) of one level the last two sides are 1 and 1; for the nodes of several levels
+    in a row, they are 1 and as many. Where there are as many as orientations, one stands for all
+    where all have the same.
+    """
+
+    passed: Tensor
+    """(3, 1, 1): the share of each cone's details that chromatic aberration leaves."""
+    frequency: Tensor
+    """(as many, 1, 1), in cycles/degree: the frequency of the best response."""
+    gain: Tensor
+    """(as many, 1, 1): what contrast is divided by."""
+    sensitivity: Tensor
+    """(channels, as many, 1, 1): the contrast sensitivity, over the gain. Where the luminance is
+    local, that of C1 and C2 in bright light."""
+
+
+class Levels(NamedTuple):
+    """The same of all levels of an image, level 0 first, without the last two sides."""
+
+    passed: Tensor
+    """(levels, 3)."""
+    frequency: Tensor
+    """(levels, as many)."""
+    gain: Tensor
+    """(levels, as many)."""
+    sensitivity: Tensor
+    """(levels, channels, as many)."""
+
+    def only(self, number: int) -> Level:
+        """Return one level."""
+        # Copies, for compiled code is specialised on the offset of a view.
+        return Level(*(part[number, ..., None, None].clone() for part in self))
+
+    def in_a_row(self, nodes: Sequence[int]) -> Level:
+        """Return the coarsest levels as one, whose plane is the ``nodes`` of each in a row."""
+        # For each node its level; the size is given so that nothing is read back from the device.
+        counts = torch.tensor(nodes, device=self.passed.device)
+        which = torch.repeat_interleave(counts, output_size=sum(nodes))
+        return Level(*(part[which].movedim(0, -1).unsqueeze(-2) for part in self))
+
+
+class Sight(NamedTuple):
+    """What turns the details of an image at a level into contrasts and weights them."""
+
+    scale: Tensor | None
+    """(B, 3, h, w): for each cone the share that chromatic aberration leaves, over what the
+    parent is adapted to. None where the details are weighted contrast already."""
+    sensitivity: Tensor
+    """(B, channels, orientations, h, w): the contrast sensitivity of each channel, or one
+    orientation or node of it where all have the same."""
+
+    def pushed(self, size: tuple[int, int]) -> "Sight":
+        """Return what is given at the parents at their children, on a plane of ``size``."""
+        shared = self.sensitivity.shape[-2:] == (1, 1)
+        sensitivity = self.sensitivity if shared else push(self.sensitivity, size)
+        return Sight(None if self.scale is None else push(self.scale, size), sensitivity)
+
+    def of(self, orientations: slice) -> "Sight":
+        """Return the sight of some orientations."""
+        if self.sensitivity.shape[2] == 1:
+            return self
+        return Sight(self.scale, self.sensitivity[:, :, orientations])
+
+
+def response(
+    details: Tensor,
+    sight: Sight,
+    matrix: Tensor,
+    exponent: Tensor,
+    signed: bool,
+    masking: bool,
+    phases: int,
+) -> Tensor:
+    """Return the responses of one level of one image: local contrast to the transducer."""
+    contrast = details
+    if sight.scale is not None:
+        contrast = opponents(local_contrast(details, sight.scale), matrix)
+    weighted = contrast * sight.sensitivity
+    if signed:
+        return signed_transducer(weighted, exponent, phases) if masking else weighted
+    return energy_transducer(weighted * weighted) if masking else weighted.abs()
+
+
+def response_difference(
+    details: Tensor,
+    other_details: Tensor,
+    sight: Sight,
+    other_sight: Sight,
+    matrix: Tensor,
+    exponent: Tensor,
+    signed: bool,
+    masking: bool,
+    phases: int,
+) -> Tensor:
+    """Return the difference of two images' responses at a level, absolute where they are signed.
+
+    Each image by itself: equal images then take equal paths through the vectorised loops, and
+    their difference is exactly 0.
+    """
+    options = matrix, exponent, signed, masking, phases
+    difference = response(details, sight, *options) - response(other_details, other_sight, *options)
+    return difference.abs() if signed else difference
+
+
+def sights_of(
+    parents: Sequence[Tensor],
+    level: Level,
+    constants: dict[str, Tensor],
+    local: bool,
+    chromatic: bool,
+) -> list[Sight]:
+    """Return `sight_at` at each of ``parents``."""
+    return [sight_at(parent, level, constants, local, chromatic) for parent in parents]
+
+
+def sight_at(
+    parent: Tensor, level: Level, constants: dict[str, Tensor], local: bool, chromatic: bool
+) -> Sight:
+    """Return the sight of a level at its parents, of which there are fewer than nodes.
+
+    ``parent`` is their lowpass (B, 3, h, w); ``local``: in the local luminance.
+    """
+    scale = level.passed / adapted(parent, constants["dark_cones"])
+    if not local:
+        return Sight(scale, level.sensitivity.unsqueeze(0))
+    return Sight(scale, sensitivity_at(parent, level, constants, chromatic))
+
+
+def adapted_luminance(lowpass: Tensor, constants: dict[str, Tensor]) -> Tensor:
+    """Return the luminance (B, 1, h, w) that the eye is adapted to, cd/m2, its own light in it."""
+    seen = mix(constants["luminance_of_cones"], lowpass).clamp_min(0.0)
+    return seen + constants["dark_light"]
+
+
+def sensitivity_at(
+    parent: Tensor, level: Level, constants: dict[str, Tensor], chromatic: bool
+) -> Tensor:
+    """Return the contrast sensitivity in the local luminance, at the parents."""
+    luminance = adapted_luminance(parent, constants).unsqueeze(2)
+    dark = torch.log2(1.0 + constants["dim_luminance"] / luminance)
+    glare = torch.log2(1.0 + luminance / constants["glare_luminance"])
+    faint = torch.log2(1.0 + constants["peak_luminance"] / luminance)
+    relative = torch.log2(level.frequency / constants["peak_frequency"])
+    octaves = relative + constants["peak_exponent"] * faint
+    dimmed = constants["achromatic_dimming"] * dark + constants["glare_exponent"] * glare
+    shape = bandpass(octaves, constants["band_width"], constants["band_floor"])
+    gain = constants["achromatic_gain"] / level.gain
+    achromatic = gain * shape * torch.exp2(-dimmed)
+    if not chromatic:
+        return achromatic
+    dim = torch.exp2(-constants["chromatic_dimming"] * dark)
+    return torch.cat((achromatic, level.sensitivity * dim), 1)
