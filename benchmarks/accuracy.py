@@ -438,8 +438,11 @@ def interleaved(
     return {name: 1e3 * statistics.median(values) for name, values in seconds.items()}
 
 
-def times(quick: bool) -> dict[str, Any]:
-    """Measure milliseconds, peak memory and the ratios to Sarnoff's model."""
+def times(quick: bool, progress: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+    """Measure milliseconds, peak memory and the ratios to Sarnoff's model.
+
+    ``progress`` is given what there is so far.
+    """
     torch.set_num_threads(THREADS)
     size = (96, 128) if quick else FULL_HD
     rounds = 1 if quick else 3
@@ -457,18 +460,15 @@ def times(quick: bool) -> dict[str, Any]:
         "threads": THREADS,
         "rounds": rounds,
         "forward_ms": interleaved(chosen, size, rounds, False),
-        "backward_ms": interleaved(losses, size, max(1, rounds - 1), True),
-        "peak_extra_megabytes": {
-            n: [_memory(n, size, b) for b in ((False, True) if n in losses else (False,))]
-            for n in chosen
-            if not quick and "compiled" not in n and not n.startswith("fast,")
-        },
+        "backward_ms": {},
+        "peak_extra_megabytes": {},
         "sarnoff_ratios": {},
     }
+    progress(result)
+    result["backward_ms"] = interleaved(losses, size, max(1, rounds - 1), True)
+    progress(result)
     names = ("fast", "fast compiled", *(n for n in everyone if n.startswith("Sarnoff")))
-    for here in ((96, 128),) if quick else ((512, 512), FULL_HD):
-        if quick:
-            break
+    for here in () if quick else ((512, 512), FULL_HD):
         found = interleaved({n: everyone[n] for n in names}, here, 5, False)
         ratios = {
             "same grid, eager": found["Sarnoff, same grid"] / found["fast"],
@@ -477,6 +477,12 @@ def times(quick: bool) -> dict[str, Any]:
             "120 pixels/degree, best": found["Sarnoff compiled"] / found["fast compiled"],
         }
         result["sarnoff_ratios"][f"{here[1]}x{here[0]}"] = {"ms": found, "ratios": ratios}
+        progress(result)
+    for name in chosen:
+        if not quick and "compiled" not in name and not name.startswith("fast,"):
+            ways = (False, True) if name in losses else (False,)
+            result["peak_extra_megabytes"][name] = [_memory(name, size, way) for way in ways]
+            progress(result)
     return result
 
 
@@ -512,7 +518,7 @@ def run(quick: bool, output: Path | None, part: str | None = None) -> None:
         before = result.get("errors", {})
         keep("errors", errors(quick, before, lambda found: keep("errors", found)))
     if part in (None, "times"):
-        keep("times", times(quick))
+        keep("times", times(quick, lambda found: keep("times", found)))
     print(table(result))
     if output is not None and "errors" in result and "times" in result:
         plot(result, output / "accuracy.png")

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Literal
 
 import pytest
 import torch
@@ -53,6 +54,19 @@ def test_batches_add_up() -> None:
     metric.reset()
     alone = metric(test, reference)
     assert alone["mean_jnd"].item() == pytest.approx(expected()[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("figure", ["mean_jnd", "max_jnd", "visible_fraction"])
+def test_one_figure_is_a_tensor_that_a_logger_takes(figure: Literal["mean_jnd"]) -> None:
+    every, one = VisualDifference(40.0), VisualDifference(40.0, figure=figure)
+    every.update(*images())
+    one.update(*images())
+    found, alone = every.compute(), one.compute()
+    assert isinstance(found, dict)
+    assert isinstance(alone, Tensor)
+    assert torch.equal(alone, found[figure])
+    with pytest.raises(ValueError, match="mean_jnd, max_jnd, visible_fraction"):
+        VisualDifference(figure="median")  # type: ignore[arg-type]
 
 
 def test_no_graph_is_kept() -> None:

@@ -3,7 +3,7 @@
 torchmetrics is not among the package's requirements: ``pip install torchmetrics``.
 """
 
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -19,19 +19,35 @@ except ImportError as error:
         "torch_vdm.metrics needs torchmetrics, which is not installed: pip install torchmetrics"
     ) from error
 
+Figure = Literal["mean_jnd", "max_jnd", "visible_fraction"]
+
+FIGURES = get_args(Figure)
+
 
 class VisualDifference(Metric):
     """Visible differences over a data set.
 
     `compute` returns a dictionary of 0-dim tensors: ``mean_jnd`` over all pixels, ``max_jnd``, and
-    ``visible_fraction``, the share of pixels over 1 JND. The states are sums, a count and a
+    ``visible_fraction``, the share of pixels over 1 JND; or one of them, as Lightning's
+    ``self.log("jnd", metric)`` takes it. The states are sums, a count and a
     maximum, in float64: batches, devices and processes add up to what one pass would give, and no
     image is kept.
 
     Parameters
     ----------
-    ppd, display, options
-        As in `VDM`; other options go to `torchmetrics.Metric`.
+    ppd, display
+        As in `VDM`.
+    vdm_options
+        More for `VDM`, by name.
+    figure
+        The one to compute, as a tensor; None: all three.
+    options
+        For `torchmetrics.Metric`.
+
+    Raises
+    ------
+    ValueError
+        Where a parameter or an image is not as stated.
     """
 
     is_differentiable = False
@@ -48,9 +64,13 @@ class VisualDifference(Metric):
         ppd: float = 60.0,
         display: Display | None = None,
         vdm_options: dict[str, Any] | None = None,
+        figure: Figure | None = None,
         **options: Any,
     ) -> None:
+        if figure not in (None, *FIGURES):
+            raise ValueError(f"expected a figure of {', '.join(FIGURES)}, got {figure!r}")
         super().__init__(**options)
+        self.figure = figure
         self.vdm = VDM(ppd, display, **(vdm_options or {}))
         zero = torch.zeros((), dtype=torch.float64)
         for name in ("pixels", "jnd", "visible"):
@@ -66,10 +86,8 @@ class VisualDifference(Metric):
         self.visible += (jnd > VISIBLE).sum()
         self.largest = torch.maximum(self.largest, jnd.max())
 
-    def compute(self) -> dict[str, Tensor]:
-        """Return mean_jnd, max_jnd and visible_fraction of everything added."""
-        return {
-            "mean_jnd": self.jnd / self.pixels,
-            "max_jnd": self.largest,
-            "visible_fraction": self.visible / self.pixels,
-        }
+    def compute(self) -> dict[str, Tensor] | Tensor:
+        """Return mean_jnd, max_jnd and visible_fraction of everything added, or one of them."""
+        figures = (self.jnd / self.pixels, self.largest, self.visible / self.pixels)
+        found = dict(zip(FIGURES, figures, strict=True))
+        return found if self.figure is None else found[self.figure]

@@ -1,0 +1,71 @@
+"""The metric and the loss as functions; the modules behind them are made once and kept."""
+
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_vdm.loss import VDMLoss
+from torch_vdm.vdm import VDM
+
+# Modules that are kept, one for each set of options and device. Status: choice.
+MOST_KEPT = 32
+
+
+def visual_difference(test: Tensor, reference: Tensor, ppd: float = 60.0, **options: Any) -> Tensor:
+    """Return the map of visible differences, (B, 1, H, W) in JND, as `VDM` does.
+
+    Parameters
+    ----------
+    test, reference
+        (B, 3, H, W), floating point, as the display expects them.
+    ppd
+        Pixels in one degree of the visual field.
+    options
+        Those of `VDM`, by name: display, observer, transform, effects, nonfinite.
+
+    Raises
+    ------
+    ValueError
+        Where an option or an image is not as stated.
+    """
+    seen: Tensor = _module(VDM, test.device, float(ppd), **options)(test, reference)
+    return seen
+
+
+def visual_difference_loss(
+    test: Tensor,
+    reference: Tensor,
+    ppd: float = 60.0,
+    mask: Tensor | None = None,
+    **options: Any,
+) -> Tensor:
+    """Return the perceptual loss, as `VDMLoss` does.
+
+    Parameters
+    ----------
+    test, reference, ppd
+        As in `visual_difference`.
+    mask
+        (B, 1, H, W), weights of the pixels.
+    options
+        Those of `VDMLoss`, by name: l1, reduction, checkpoint, and those of `VDM`.
+
+    Returns
+    -------
+    Tensor
+        A scalar, or (B,) with ``reduction="none"``.
+
+    Raises
+    ------
+    ValueError
+        Where an option or an image is not as stated.
+    """
+    loss: Tensor = _module(VDMLoss, test.device, float(ppd), **options)(test, reference, mask)
+    return loss
+
+
+@lru_cache(MOST_KEPT)
+def _module(kind: type[VDM | VDMLoss], device: torch.device, ppd: float, **options: Any) -> Any:
+    return kind(ppd, **options).to(device)
