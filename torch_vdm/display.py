@@ -97,15 +97,16 @@ class Display:
         Tensor
             (B, 3, H, W), within +-1e12 cd/m2.
         """
-        if self.encoding == "xyz":
-            return image.clamp(-BRIGHTEST, BRIGHTEST)
-        limit = BRIGHTEST / self.gain
-        if self.encoding == "srgb":
-            image = decode_srgb(image)
-        if self.encoding == "linear" or limit < LARGEST_CODE**SRGB_EXPONENT:
-            image = image.clamp(-limit, limit)
+        values = linear_values(image, self.encoding, self.limit(image))
         # The gain goes into nine numbers instead of every pixel.
-        return mix(primaries * self.gain, image)
+        return values if self.encoding == "xyz" else mix(primaries * self.gain, values)
+
+    def limit(self, image: Tensor) -> Tensor | None:
+        """Return what linear values are held to, like ``image``; None where no code passes it."""
+        limit = BRIGHTEST / self.gain
+        if self.encoding == "srgb" and limit >= LARGEST_CODE**SRGB_EXPONENT:
+            return None
+        return image.new_full((), limit)
 
     def to_code(self, image: Tensor) -> Tensor:
         """Return sRGB-coded values: those of an sRGB display, or of light over white.
@@ -119,6 +120,13 @@ class Display:
         white = XYZ_WHITE if self.encoding == "xyz" else self.white
         light = image * (self.gain / white)
         return encode_srgb(light.clamp(-BRIGHTEST, BRIGHTEST))
+
+
+def linear_values(image: Tensor, encoding: str, limit: Tensor | None) -> Tensor:
+    """Return the linear values of an image (B, 3, H, W), within +-``limit``."""
+    if encoding == "srgb":
+        image = decode_srgb(image)
+    return image if limit is None else image.clamp(-limit, limit)
 
 
 def encode_srgb(light: Tensor) -> Tensor:

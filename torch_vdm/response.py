@@ -1,7 +1,7 @@
 """One level of an image from details to responses: Fig. 2 from the third box to the seventh."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -118,6 +118,21 @@ def response_difference(
     options = matrix, exponent, signed, masking, phases
     difference = response(details, sight, *options) - response(other_details, other_sight, *options)
     return difference.abs() if signed else difference
+
+
+def response_difference_at(
+    details: Tensor,
+    other_details: Tensor,
+    parents: Sequence[Tensor],
+    level: Level,
+    constants: dict[str, Tensor],
+    local: bool,
+    chromatic: bool,
+    *options: Any,
+) -> Tensor:
+    """Return `response_difference` with the sight at ``parents``, given for every node."""
+    first, second = sights_of(parents, level, constants, local, chromatic)
+    return response_difference(details, other_details, first, second, *options)
 
 
 def sights_of(

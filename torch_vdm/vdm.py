@@ -19,7 +19,7 @@ from torch_vdm.contrast import (
 from torch_vdm.cortex import DEEPEST, Cortex, Haar, Transform, bands
 from torch_vdm.cortex.transform import Base, mean_of
 from torch_vdm.csf import barten, butterworth
-from torch_vdm.display import BT709_TO_XYZ, Display
+from torch_vdm.display import BT709_TO_XYZ, Display, linear_values
 from torch_vdm.distance import (
     accumulate,
     just_noticeable,
@@ -41,6 +41,7 @@ from torch_vdm.response import (
     adapted_luminance,
     response,
     response_difference,
+    response_difference_at,
     sensitivity_at,
     sights_of,
 )
@@ -298,7 +299,12 @@ class VDM(TiledMetric):
     def _cone_planes(self, image: Tensor) -> Tensor:
         """Return the cone responses (B, 3, H, W) to an image: display, cones."""
         constants = self._constants(image.dtype, "primaries", "cones")
-        around = self.display, constants["primaries"], constants["cones"]
+        # From the display's primaries to cones at once: one mixing of all pixels instead of two.
+        matrix = constants["cones"]
+        if self.display.encoding != "xyz":
+            matrix = product(matrix, constants["primaries"]) * self.display.gain
+        # Numbers as tensors: compiled code is specialised on others.
+        around = self.display.encoding, self.display.limit(image), matrix
         if self._fast:
             planes: Tensor = compiled(_light)(image, *around)
             return planes
@@ -449,15 +455,21 @@ class VDM(TiledMetric):
             for number, size in enumerate(sizes)
         )
         fast = self._fast and details[0].numel() >= SMALLEST
-        one, other = (parent.clone() for parent in parents.chunk(2))
-        sights = self._sights(levels.in_a_row(nodes), constants, (one, other), fast)
-        respond = compiled(response_difference) if fast else response_difference
-        difference = respond(
-            details[0], details[1], sights[0], sights[1], *self._options(constants)
-        )
+        both = [parent.clone() for parent in parents.chunk(2)]
+        level, options = levels.in_a_row(nodes), self._options(constants)
+        if self.transform.csf == "filter":
+            first_sight, second_sight = self._sights(level, constants, both)
+            difference = response_difference(
+                details[0], details[1], first_sight, second_sight, *options
+            )
+        else:
+            respond = compiled(response_difference_at) if fast else response_difference_at
+            local = self.observer.adaptation_luminance is None
+            around = constants, local, self.effects.chromatic
+            difference = respond(details[0], details[1], both, level, *around, *options)
         pooled = [self._pooled(plane) for plane in _planes(difference, sizes)]
-        local = self._summed(_in_a_row(pooled), constants["summation_exponent"])
-        return _planes(local, [_size(plane) for plane in pooled])
+        summed = self._summed(_in_a_row(pooled), constants["summation_exponent"])
+        return _planes(summed, [_size(plane) for plane in pooled])
 
     def _local_difference(
         self,
@@ -617,12 +629,9 @@ def _planes(row: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Tensor]:
     return [part.unflatten(-1, size) for part, size in zip(parts, sizes, strict=True)]
 
 
-def _light(image: Tensor, display: Display, primaries: Tensor, cones: Tensor) -> Tensor:
-    """Return the cone responses (B, 3, H, W) to an image on a display."""
-    if display.encoding == "xyz":
-        return cone_responses(display.to_xyz(image, primaries), cones)
-    # From the display's primaries to cones at once: one mixing of all pixels instead of two.
-    return display.to_xyz(image, product(cones, primaries))
+def _light(image: Tensor, encoding: str, limit: Tensor | None, matrix: Tensor) -> Tensor:
+    """Return the cone responses (B, 3, H, W) to an image; ``matrix`` is of linear values."""
+    return cone_responses(linear_values(image, encoding, limit), matrix)
 
 
 def _band_sensitivity(lowpass: Tensor, table: Tensor, constants: dict[str, Tensor]) -> Tensor:
