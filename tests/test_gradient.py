@@ -78,6 +78,22 @@ def test_is_of_use_on_the_default_route() -> None:
     assert "_LocalDifferenceBackward" in {node.name() for node in seen}
 
 
+@pytest.mark.parametrize("name", ["transducer_exponent", "summation_exponent", "opponents"])
+def test_a_constant_that_is_fitted_has_its_gradient(name: str) -> None:
+    metric = VDM()
+    test, reference = noise((12, 9))
+    constant = metric.get_buffer(name).requires_grad_()
+    (slope,) = torch.autograd.grad(metric.power(test, reference).sum(), constant)
+    with torch.no_grad():
+        step = 1e-6 * torch.ones_like(constant)
+        ends = []
+        for way in (1.0, -1.0):
+            constant += way * step
+            ends.append(metric.power(test, reference).sum())
+            constant -= way * step
+    torch.testing.assert_close(slope.sum(), (ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=0.0)
+
+
 @pytest.mark.parametrize("value", [0.0, 0.5])
 def test_is_0_at_equality(value: float) -> None:
     image = torch.full((1, 3, 16, 16), value)

@@ -507,7 +507,8 @@ class VDM(TiledMetric):
             and self.effects.pooling
             and self.transform.csf == "levels"
             and self.transform.shifts == self.transform.phases == 1
-            and not fast
+            and not (fast or options[0].requires_grad)
+            and not (options[1].requires_grad or exponent.requires_grad)
         )
         local = []
         planes = zip(details.split(at_once, 2), others.split(at_once, 2), strict=True)
