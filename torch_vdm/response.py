@@ -12,6 +12,23 @@ from torch_vdm.masking import energy_transducer, signed_transducer
 from torch_vdm.matrix import mix
 from torch_vdm.quadtree import push
 
+# The constants that the sensitivity in the local luminance depends on.
+OF_LUMINANCE = (
+    "luminance_of_cones",
+    "dark_light",
+    "dim_luminance",
+    "glare_luminance",
+    "peak_luminance",
+    "peak_frequency",
+    "peak_exponent",
+    "achromatic_gain",
+    "achromatic_dimming",
+    "glare_exponent",
+    "chromatic_dimming",
+    "band_width",
+    "band_floor",
+)
+
 
 class Level(NamedTuple):
     """What a level of the transform responds to, as far as it does not depend on the image.

@@ -35,6 +35,7 @@ from torch_vdm.pair import Nonfinite
 from torch_vdm.pooling import glance, phase_energy, pool, pool_halves, surround, surround_halves
 from torch_vdm.quadtree import push
 from torch_vdm.response import (
+    OF_LUMINANCE,
     Level,
     Levels,
     Sight,
@@ -464,8 +465,7 @@ class VDM(TiledMetric):
             )
         else:
             respond = compiled(response_difference_at) if fast else response_difference_at
-            local = self.observer.adaptation_luminance is None
-            around = constants, local, self.effects.chromatic
+            around = self._sight_options(constants)
             difference = respond(details[0], details[1], both, level, *around, *options)
         pooled = [self._pooled(plane) for plane in _planes(difference, sizes)]
         summed = self._summed(_in_a_row(pooled), constants["summation_exponent"])
@@ -575,9 +575,15 @@ class VDM(TiledMetric):
         if self.transform.csf == "filter":
             return [Sight(None, (1.0 / level.gain)[None, None])] * len(parents)
         look = compiled(sights_of) if fast else sights_of
-        local = self.observer.adaptation_luminance is None
-        sights: list[Sight] = look(parents, level, constants, local, self.effects.chromatic)
+        sights: list[Sight] = look(parents, level, *self._sight_options(constants))
         return sights
+
+    def _sight_options(self, constants: dict[str, Tensor]) -> tuple[dict[str, Tensor], bool, bool]:
+        """Return what `sights_of` takes beside parents and level."""
+        local = self.observer.adaptation_luminance is None
+        # No more than it needs: a compiled function checks every tensor that it is given.
+        names = ("dark_cones", *(OF_LUMINANCE if local else ()))
+        return {name: constants[name] for name in names}, local, self.effects.chromatic
 
     def _levels(self, finest: int, count: int, constants: dict[str, Tensor]) -> Levels:
         """Return what ``count`` levels respond to, from the level ``finest``; the coarsest first.
