@@ -95,13 +95,21 @@ class Model:
         """Return how much each pixel's noise adds to the largest totals, (H, W), not negative.
 
         Minus the derivative of a sum of the totals to the power of `SHARPNESS` by the logarithm
-        of each pixel's samples, in units of the whole.
+        of each pixel's samples, in units of the whole; the mean over a pixel's surroundings, so that
+        its own luck, which makes its variance too, hardly moves its samples and biases its mean.
         """
         logarithm = torch.zeros(self.size, dtype=torch.float64, requires_grad=True)
         totals = self._totals(self.variance * torch.exp(-logarithm))
         largest = totals.detach().amax().clamp_min(1e-300)
         (gradient,) = torch.autograd.grad(((totals / largest) ** SHARPNESS).sum(), logarithm)
-        shares: NDArray[np.float64] = gradient.neg().clamp_min(0.0).numpy()
+        around = functional.avg_pool2d(
+            gradient.neg().clamp_min(0.0)[None, None],
+            2 * SURROUNDINGS + 1,
+            1,
+            SURROUNDINGS,
+            count_include_pad=False,
+        )
+        shares: NDArray[np.float64] = around[0, 0].numpy()
         return shares / max(float(shares.sum()), 1e-300)
 
     def _totals(self, variance: Tensor) -> Tensor:
