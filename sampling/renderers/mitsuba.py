@@ -30,7 +30,7 @@ VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 # for each. Status: choice, measured.
 BATCH = 2**20
 
-# Of Dr.Jit's pool: with one, loading a bitmap never ends. Status: measured, Dr.Jit of Mitsuba 3.9.1.
+# Of Dr.Jit's pool: with one thread, loading a bitmap never ends. Status: measured, Mitsuba 3.9.1.
 FEWEST_THREADS = 2
 
 # What is asked of the `aov` integrator, in its own words, and how many numbers it gives.
