@@ -100,15 +100,12 @@ class Model:
     def shares(self) -> NDArray[np.float64]:
         """Return how much each pixel's noise adds to the largest totals, (H, W), not negative.
 
-        In units of the whole: the mean of `_slopes` from the image as plain and as textured as it
-        may be; then the geometric mean with its surroundings, so that a pixel's own luck, which
-        makes its variance too, moves its samples less and biases its mean less. The arithmetic one
-        would give a black background beside a light the light's samples.
+        The mean of what `_slopes` finds from the image as plain and as textured as it may be, in
+        units of the whole.
         """
-        own = 0.5 * (self._slopes(self.truth) + self._slopes(self.textured))
-        around = functional.avg_pool2d(own[None, None], 3, 1, 1, count_include_pad=False)[0, 0]
-        shares: NDArray[np.float64] = (own * around).sqrt().numpy()
-        return shares / max(float(shares.sum()), 1e-300)
+        found = 0.5 * (self._slopes(self.truth) + self._slopes(self.textured))
+        shares: NDArray[np.float64] = found.numpy()
+        return shares
 
     def _slopes(self, truth: Cortex) -> Tensor:
         """Return minus the derivative of a sum of the totals, to the power of `SHARPNESS`.

@@ -109,34 +109,19 @@ def test_slopes_are_the_derivative_of_the_largest_totals(observer: Observer) -> 
 
 
 @each_observer
-def test_the_luck_of_a_pixel_moves_its_shares_less(observer: Observer) -> None:
-    """On a flat wall in rare light, where all but the border should have the same."""
-    renderer = Synthetic(
-        np.full((32, 32, 3), 0.2), np.full((32, 32, 3), 0.3), np.full((32, 32), 0.05)
-    )
-    metric = VDM(60.0, Display.linear(), observer)
-    model = Model(metric, drawn(renderer, 64), renderer.size)
-    shares = model.shares()
-    assert shares.sum() == pytest.approx(1.0)
-    assert (shares >= 0.0).all()
-    scatter = [
-        np.log(plane[8:-8, 8:-8]).std() for plane in (shares, model._slopes(model.truth).numpy())
-    ]
-    assert scatter[0] < 0.8 * scatter[1]
-
-
-@each_observer
-def test_black_beside_a_light_gets_none_of_its_share(observer: Observer) -> None:
-    """Where a share is 0, its surroundings do not change that."""
+def test_shares_are_of_the_plain_and_the_textured_image(observer: Observer) -> None:
+    """Half and half, in units of the whole; none where there is no noise."""
     event = np.zeros((16, 16, 3))
     event[:, 8:] = 0.1
     renderer = Synthetic(np.full((16, 16, 3), 0.2), event, np.full((16, 16), 0.5))
-    statistics = drawn(renderer, 256)
-    model = Model(VDM(60.0, Display.linear(), observer), statistics, renderer.size)
+    model = Model(VDM(60.0, Display.linear(), observer), drawn(renderer, 256), renderer.size)
     model.variance[..., :8] = 0.0
     shares = model.shares()
+    assert shares.sum() == pytest.approx(1.0)
     assert (shares[:, :8] == 0.0).all()
     assert (shares[:, 8:] > 0.0).any()
+    for truth in (model.truth, model.textured):
+        assert (shares >= 0.5 * model._slopes(truth).numpy()).all()
 
 
 @each_observer
