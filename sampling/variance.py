@@ -73,7 +73,7 @@ def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
         fourth = kurtosis * scalar_second(covariance) ** 2
         prior = np.concatenate((covariance, fourth[None]))
         worth = _worth(scalar_second(own[:6]), scalar_second(prior[:6]), freedom)
-        weight = _chance_of_noise(own, freedom) * worth / (worth + freedom)
+        weight = _chance_of_light(own, own_mean, freedom) * worth / (worth + freedom)
         estimate = weight * prior + (1.0 - weight) * own
     return estimate[:6]
 
@@ -90,16 +90,16 @@ def _worth(own: Plane, prior: Plane, freedom: Plane) -> Plane:
     return np.clip(2.0 / np.maximum(spread, 1e-9), PRIOR, LARGEST_PRIOR)
 
 
-def _chance_of_noise(own: Plane, freedom: Plane) -> Plane:
-    """Return how likely it is that a node has noise at all: 1 where it has shown any.
+def _chance_of_light(own: Plane, mean: Plane, freedom: Plane) -> Plane:
+    """Return how likely it is that a node has light at all: 1 where it has shown any.
 
-    What has not changed from sample to sample is as a rule the background, black or a plain sky, or
-    a lamp, and no sample will change it. Had a share of the node, whichever, its parent's noise, it
-    would show none in ``freedom`` / 2 expected events with a chance of 2 / freedom; against an even
-    chance of its having none. Without this a black background beside a light that is seldom hit
-    took most samples, for there is nothing in it that noise could hide behind.
+    What is black is as a rule the background, or a black surface, and no sample will change it. Had
+    a share of the node, whichever, its parent's light, it would show none in ``freedom`` / 2
+    expected events with a chance of 2 / freedom; against an even chance of its being black.
+    Without this a black background beside a light that is seldom hit took most samples, for there
+    is nothing in it that noise could hide behind.
     """
-    shown = (own[:6] != 0.0).any(0)
+    shown = (own[:6] != 0.0).any(0) | (mean != 0.0).any(0)
     return np.where(shown, 1.0, 1.0 / np.maximum(1.0, 0.5 * freedom))
 
 
