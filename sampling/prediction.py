@@ -81,6 +81,12 @@ class Model:
                 for detail, variance in zip(self.cortex.details, self.details, strict=True)
             )
         )
+        self.textured = self.cortex._replace(
+            details=tuple(
+                _textured(detail, variance)
+                for detail, variance in zip(self.cortex.details, self.details, strict=True)
+            )
+        )
 
     def totals(self, count: NDArray[np.float64] | None = None) -> Tensor:
         """Return the total error of the finest nodes by the boundary images, (1, 1, h, w).
@@ -94,19 +100,28 @@ class Model:
     def shares(self) -> NDArray[np.float64]:
         """Return how much each pixel's noise adds to the largest totals, (H, W), not negative.
 
-        Minus the derivative of a sum of the totals to the power of `SHARPNESS` by the logarithm
-        of each pixel's samples, in units of the whole.
+        The mean of what `_slopes` finds from the image as plain and as textured as it may be, in
+        units of the whole.
+        """
+        found = 0.5 * (self._slopes(self.truth) + self._slopes(self.textured))
+        shares: NDArray[np.float64] = found.numpy()
+        return shares
+
+    def _slopes(self, truth: Cortex) -> Tensor:
+        """Return minus the derivative of a sum of the totals, to the power of `SHARPNESS`.
+
+        By the logarithm of each pixel's samples, (H, W), in units of the whole, not negative.
         """
         logarithm = torch.zeros(self.size, dtype=torch.float64, requires_grad=True)
-        totals = self._totals(self.variance * torch.exp(-logarithm))
+        totals = self._totals(self.variance * torch.exp(-logarithm), truth)
         largest = totals.detach().amax().clamp_min(1e-300)
         (gradient,) = torch.autograd.grad(((totals / largest) ** SHARPNESS).sum(), logarithm)
-        shares: NDArray[np.float64] = gradient.neg().clamp_min(0.0).numpy()
-        return shares / max(float(shares.sum()), 1e-300)
+        slopes = gradient.neg().clamp_min(0.0)
+        return slopes / slopes.sum().clamp_min(1e-300)
 
-    def _totals(self, variance: Tensor) -> Tensor:
+    def _totals(self, variance: Tensor, truth: Cortex | None = None) -> Tensor:
         lower, upper = boundaries(
-            self.truth,
+            self.truth if truth is None else truth,
             detail_variances(variance, self.true_means),
             variance.mean((-2, -1), keepdim=True) / variance[0, 0].numel(),
             QUARTILE,
@@ -220,6 +235,45 @@ def _shrunk(detail: Tensor, variance: Tensor) -> Tensor:
         _around(variance) / _around(power).clamp_min(NONE), DOUBT * variance / power.clamp_min(NONE)
     )
     return detail * (1.0 - share).clamp_min(0.0)
+
+
+def _textured(detail: Tensor, variance: Tensor) -> Tensor:
+    """Return the details as large as they probably are, where their neighbours show a texture.
+
+    The root mean square of a normal detail given what was seen of it, never under `_shrunk`. How
+    large details are here is the least of what the four squares of 2x2 nodes around a node say,
+    less noise, all orientations together: the least, for a plain node beside an edge is no
+    texture, and without the node itself, for noise is not to mask itself.
+    """
+    power = (detail * detail).clamp_min(NONE)
+    prior = _least(power - variance).clamp_min(0.0)
+    keep = prior / (prior + variance).clamp_min(NONE)
+    likely = (keep * (keep * power + variance)).sqrt()
+    return torch.where(detail < 0.0, -1.0, 1.0) * torch.maximum(
+        likely, _shrunk(detail, variance).abs()
+    )
+
+
+def _least(energy: Tensor) -> Tensor:
+    """Return the least mean of a node's 2x2 squares without itself, (B, C, 1, h, w).
+
+    Of (B, C, 3, h, w), and over the three orientations; 0 for a node that is alone.
+    """
+    plane = energy.mean(2)
+    size = (plane.shape[-2], plane.shape[-1])
+
+    def squares(nodes: Tensor) -> Tensor:
+        """Return the sums of all 2x2 squares that have a node."""
+        return functional.avg_pool2d(functional.pad(nodes, (1, 1, 1, 1)), 2, 1) * 4.0
+
+    sums, counts = squares(plane), squares(torch.ones_like(plane[:1, :1])) - 1.0
+    least = torch.full_like(plane, math.inf)
+    for y in (0, 1):
+        for x in (0, 1):
+            window = (..., slice(y, y + size[0]), slice(x, x + size[1]))
+            others = (sums[window] - plane) / counts[window].clamp_min(1.0)
+            least = torch.where(counts[window] > 0.5, torch.minimum(least, others), least)
+    return torch.where(least.isinf(), 0.0, least)[:, :, None]
 
 
 def _around(plane: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """The renderer on Mitsuba: its numbers against themselves and against Mitsuba's own image."""
 
 import math
+import os
 import re
 import subprocess
 import sys
@@ -130,6 +131,22 @@ def test_another_process_without_llvm_draws_the_same(still_life: Path, tmp_path:
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
     here = draw(MitsubaRenderer(still_life, parameters, variant="scalar_rgb"), 5)
     np.testing.assert_array_equal(np.load(tmp_path / "radiance.npy"), here.radiance)
+
+
+@pytest.mark.usefixtures("mitsuba")
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs Linux")
+def test_on_a_single_core_the_pool_has_a_thread_to_spare() -> None:
+    """With one thread Dr.Jit waits for ever where a scene names a bitmap."""
+    code = (
+        "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "from sampling.renderers.mitsuba import load_mitsuba\n"
+        "load_mitsuba('llvm_ad_rgb')\n"
+        "import drjit; print(drjit.thread_count())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout) >= 2
 
 
 def test_seeds_pixels_and_samples_have_numbers_of_their_own(still_life: Path) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sampling.prediction import MOST_DRAWS, Model, _factor, _shrunk
+from sampling.prediction import MOST_DRAWS, Model, _factor, _shrunk, _textured
 from sampling.renderers.synthetic import Synthetic
 from sampling.statistics import FIRST, SECOND, Statistics
 from torch_vdm import VDM, Display, Observer
@@ -52,6 +52,29 @@ def test_a_detail_is_never_enlarged_and_noise_is_taken_away() -> None:
     torch.testing.assert_close(_shrunk(texture, 0.0 * one), texture)
 
 
+def test_a_texture_in_noise_keeps_its_contrast_and_a_plain_node_beside_it_has_none() -> None:
+    """A texture of twice the noise: a single detail of it is not to be told from noise."""
+    generator = torch.Generator().manual_seed(2)
+    texture, noise = torch.randn(2, 1, 3, 3, 64, 64, generator=generator, dtype=torch.float64)
+    texture = 2.0 * texture
+    texture[..., :32] = 0.0
+    seen, one = texture + noise, torch.ones_like(noise)
+    found, shrunk = _textured(seen, one), _shrunk(seen, one)
+    assert (found.abs() >= shrunk.abs()).all()
+    assert (found * seen >= 0.0).all()
+
+    def size(details: torch.Tensor) -> float:
+        return float((details**2).mean().sqrt())
+
+    true = size(texture[..., 34:])
+    assert size(shrunk[..., 34:]) < 0.5 * true
+    assert size(found[..., 34:]) == pytest.approx(true, rel=0.25)
+    # The plain half stays plain up to its border, where a mean of 3x3 nodes would find 0.95.
+    assert size(found[..., :28]) < 0.2
+    assert size(found[..., 31]) < 0.3
+    torch.testing.assert_close(_textured(texture, 0.0 * one), texture, atol=1e-90, rtol=1e-12)
+
+
 @each_observer
 def test_more_samples_mean_less_error(observer: Observer) -> None:
     renderer = wall()
@@ -63,13 +86,13 @@ def test_more_samples_mean_less_error(observer: Observer) -> None:
 
 
 @each_observer
-def test_shares_are_the_derivative_of_the_largest_totals(observer: Observer) -> None:
-    """Against central differences; and all to the corner that alone is noisy."""
+def test_slopes_are_the_derivative_of_the_largest_totals(observer: Observer) -> None:
+    """Against central differences."""
     renderer = wall(size=(5, 6))
     metric = VDM(60.0, Display.linear(), observer)
     model = Model(metric, drawn(renderer, 64), renderer.size)
-    shares = model.shares()
-    assert shares.sum() == pytest.approx(1.0)
+    found = model._slopes(model.truth).numpy().reshape(-1)
+    assert found.sum() == pytest.approx(1.0)
     sums = []
     for pixel in (0, 8, 29):
         for step in (1e-4, -1e-4):
@@ -80,9 +103,25 @@ def test_shares_are_the_derivative_of_the_largest_totals(observer: Observer) -> 
     slopes = np.array(sums).reshape(3, 2) @ [-0.5e4, 0.5e4]
     np.testing.assert_allclose(
         slopes / slopes.sum(),
-        shares.reshape(-1)[[0, 8, 29]] / shares.reshape(-1)[[0, 8, 29]].sum(),
+        found[[0, 8, 29]] / found[[0, 8, 29]].sum(),
         rtol=1e-4,
     )
+
+
+@each_observer
+def test_shares_are_of_the_plain_and_the_textured_image(observer: Observer) -> None:
+    """Half and half, in units of the whole; none where there is no noise."""
+    event = np.zeros((16, 16, 3))
+    event[:, 8:] = 0.1
+    renderer = Synthetic(np.full((16, 16, 3), 0.2), event, np.full((16, 16), 0.5))
+    model = Model(VDM(60.0, Display.linear(), observer), drawn(renderer, 256), renderer.size)
+    model.variance[..., :8] = 0.0
+    shares = model.shares()
+    assert shares.sum() == pytest.approx(1.0)
+    assert (shares[:, :8] == 0.0).all()
+    assert (shares[:, 8:] > 0.0).any()
+    for truth in (model.truth, model.textured):
+        assert (shares >= 0.5 * model._slopes(truth).numpy()).all()
 
 
 @each_observer

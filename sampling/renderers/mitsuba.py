@@ -30,6 +30,9 @@ VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 # for each. Status: choice, measured.
 BATCH = 2**20
 
+# Of Dr.Jit's pool: with one thread, loading a bitmap never ends. Status: measured, Mitsuba 3.9.1.
+FEWEST_THREADS = 2
+
 # What is asked of the `aov` integrator, in its own words, and how many numbers it gives.
 AOVS = "albedo:albedo,normal:sh_normal,depth:depth"
 AOV_NAMES = ("albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal.Z", "depth.Z")
@@ -338,6 +341,9 @@ def load_mitsuba(variant: str = "auto") -> Any:
     if not usable[variant]:
         need = f"an LLVM; install {PACKAGE}, or set {VARIABLE}" if "llvm" in variant else "a GPU"
         raise SceneError(f"{variant} needs {need}")
+    # As on a machine, or in a container, of a single core.
+    if dr.thread_count() < FEWEST_THREADS:
+        dr.set_thread_count(FEWEST_THREADS)
     mi.set_variant(variant)
     # Its warnings would break the live line; what matters is told here.
     mi.set_log_level(mi.LogLevel.Error)
