@@ -26,7 +26,7 @@ def circumstances() -> dict[str, Any]:
     """Return what a figure depends on besides the code."""
     return {
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "command": " ".join(["python -m benchmarks", *sys.argv[1:]]),
+        "command": " ".join(["python -m benchmarks", *_arguments()]),
         "machine": {
             "processor": _processor(),
             "threads": torch.get_num_threads(),
@@ -38,6 +38,12 @@ def circumstances() -> dict[str, Any]:
             **{name: importlib.metadata.version(name) for name in PACKAGES},
         },
     }
+
+
+def _arguments() -> list[str]:
+    """Return the command's arguments but for where results go, on which no figure depends."""
+    words = iter(sys.argv[1:])
+    return [word for word in words if word != "--output" or next(words, "") is None]
 
 
 def caption(result: dict[str, Any]) -> str:
