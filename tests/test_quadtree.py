@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from torch_vdm import quadtree
 from torch_vdm.quadtree import pad_even, push
 
 SIZES = [(1, 1), (1, 2), (2, 1), (2, 2), (3, 5), (8, 8), (7, 12)]
@@ -31,3 +32,16 @@ def test_push_gives_children_their_parent(height: int, width: int) -> None:
 def test_even_planes_are_not_copied() -> None:
     plane = torch.rand(1, 3, 4, 6)
     assert pad_even(plane) is plane
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 4, 5), (1, 3, 3, 7, 1), (1, 1, 1, 1)], ids=str)
+def test_both_ways_of_pushing_are_one(
+    shape: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nodes = torch.rand(shape, dtype=torch.float64)
+    sizes = [(2 * shape[-2] - odd, 2 * shape[-1] - odd) for odd in (0, 1)]
+    small = [push(nodes, size) for size in sizes]
+    monkeypatch.setattr(quadtree, "SMALL", 0)
+    for size, children in zip(sizes, small, strict=True):
+        assert children.shape == (*shape[:-2], *size)
+        assert torch.equal(children, push(nodes, size))

@@ -26,7 +26,14 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     from torch._dynamo import config as dynamo
     from torch.fx.experimental import _config as shapes
 
-    specialised = torch.compile(function, dynamic=True, fullgraph=True)
+    specialised = torch.compile(
+        function,
+        dynamic=True,
+        fullgraph=True,
+        # The functions and numbers that it names do not change; to check in every call that they
+        # have not takes longer than the rest of its checks.
+        options={"guard_filter_fn": torch.compiler.skip_guard_on_globals_unsafe},
+    )
 
     def call(*arguments: object) -> Any:
         if torch.compiler.is_compiling():
