@@ -611,7 +611,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
     """Draw error against time: the ladder as a line, peers as points, the paper's 1/60 marked."""
     human, cost = result["errors"]["human"], result["times"]["forward_ms"]
     held_out = result["errors"]["held_out"]
-    figure = record.blank_figure(8.0, 4.6)
+    figure = record.blank_figure(9.6, 4.6)
     axes = figure.subplots(1, 2, sharex=True)
     alike = {name: of["one_gain_a_study"]["achromatic"] for name, of in human.items()}
     panels = (
@@ -663,30 +663,34 @@ def plot(result: dict[str, Any], path: Path) -> None:
                 color="grey",
             )
         axis.set_xscale("log")
-        axis.margins(x=0.12)
+        axis.margins(x=0.18, y=0.1)
         axis.set_ylim(bottom=0.0)
         axis.set_title(title, fontsize=10)
         axis.set_xlabel("milliseconds, 1920 x 1080, forward")
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("rms error at human thresholds, dB")
-    axes[0].legend(frameon=False, fontsize=7)
+    axes[0].legend(frameon=False, fontsize=7, loc="center right", bbox_to_anchor=(1.0, 0.55))
     figure.savefig(path)
 
 
+# Where a name stands beside its point, so that none covers another: to the right, but for these.
+SIDES = {
+    **dict.fromkeys(RUNGS, "below"),
+    **dict.fromkeys(("paper's observer", "FLIP", "Sarnoff", "Haar, filter"), "left"),
+    "StationaryHaar, filter": "above",
+}
+PLACES = {
+    "below": {"xytext": (0, -6), "ha": "center", "va": "top"},
+    "above": {"xytext": (0, 6), "ha": "center", "va": "bottom"},
+    "left": {"xytext": (-7, 0), "ha": "right", "va": "center"},
+    "right": {"xytext": (7, 0), "ha": "left", "va": "center"},
+}
+
+
 def _label(axis: Any, name: str, x: float, y: float, colour: str) -> None:
-    # The ladder's below its points, others' above theirs.
-    below = name in RUNGS
-    axis.annotate(
-        name,
-        (x, y),
-        textcoords="offset points",
-        xytext=(0, -5) if below else (0, 5),
-        ha="center",
-        va="top" if below else "bottom",
-        fontsize=7,
-        color=colour,
-    )
+    place = PLACES[SIDES.get(name, "right")]
+    axis.annotate(name, (x, y), textcoords="offset points", fontsize=7, color=colour, **place)
 
 
 if __name__ == "__main__":
