@@ -676,15 +676,17 @@ def plot(result: dict[str, Any], path: Path) -> None:
 
 # Where a name stands beside its point, so that none covers another: to the right, but for these.
 SIDES = {
-    **dict.fromkeys(RUNGS, "below"),
-    **dict.fromkeys(("paper's observer", "FLIP", "Sarnoff", "Haar, filter"), "left"),
-    "StationaryHaar, filter": "above",
+    **dict.fromkeys(("standard", "reference"), "below"),
+    **dict.fromkeys(("fast", "paper's observer", "FLIP", "Sarnoff"), "left"),
+    "Haar, filter": "above",
+    "StationaryHaar, filter": "beside",
 }
 PLACES = {
     "below": {"xytext": (0, -6), "ha": "center", "va": "top"},
     "above": {"xytext": (0, 6), "ha": "center", "va": "bottom"},
     "left": {"xytext": (-7, 0), "ha": "right", "va": "center"},
     "right": {"xytext": (7, 0), "ha": "left", "va": "center"},
+    "beside": {"xytext": (5, 5), "ha": "left", "va": "bottom"},
 }
 
 
