@@ -50,7 +50,7 @@ class VDMLoss(nn.Module):
         Over the batch: "mean", "sum", or "none" for one value an item, (B,).
     checkpoint
         Whether to keep less for the backward pass and compute it again there: about a third less
-        memory for a quarter more time, with the same gradients. Not with `torch.func`.
+        memory for up to a quarter more time, with the same gradients. Not with `torch.func`.
 
     Raises
     ------
