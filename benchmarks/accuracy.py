@@ -681,7 +681,7 @@ SIDES = {
     "Haar, filter": "above",
     "StationaryHaar, filter": "beside",
 }
-PLACES = {
+PLACES: dict[str, Any] = {
     "below": {"xytext": (0, -6), "ha": "center", "va": "top"},
     "above": {"xytext": (0, 6), "ha": "center", "va": "bottom"},
     "left": {"xytext": (-7, 0), "ha": "right", "va": "center"},
