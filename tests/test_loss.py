@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, VDMLoss
 from torch_vdm.cortex import Transform
+from torch_vdm.gradient import by_hand
 from torch_vdm.loss import DARK_LIGHT
 
 
@@ -150,12 +151,9 @@ def test_orders_images_as_the_map_does_near_threshold() -> None:
         assert np.corrcoef(*ranks)[0, 1] > least, weight
 
 
-# Of Haar most is not kept in any case: its gradient is worked out by hand.
-@pytest.mark.parametrize(
-    ("transform", "share"), [(Haar(), 0.7), (StationaryHaar(), 0.5), (Steerable(), 0.5)]
-)
+@pytest.mark.parametrize("transform", [Haar(), StationaryHaar(), Steerable()])
 def test_a_checkpoint_changes_no_gradient(
-    transform: Transform, share: float, monkeypatch: pytest.MonkeyPatch
+    transform: Transform, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # In parts and level by level, as a large image is.
     monkeypatch.setattr("torch_vdm.vdm.LARGEST_AT_ONCE", 1000)
@@ -172,13 +170,15 @@ def test_a_checkpoint_changes_no_gradient(
 
     for checkpoint in (False, True):
         loss = VDMLoss(transform=transform, checkpoint=checkpoint)
+        # Against what autograd keeps: where the gradient is worked out by hand, that is less.
+        monkeypatch.setattr("torch_vdm.vdm.by_hand", by_hand if checkpoint else lambda: False)
         kept.append({})
         with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
             value = loss(test, reference)
         gradients.append(torch.autograd.grad(value, test)[0])
     torch.testing.assert_close(gradients[1], gradients[0], rtol=0.0, atol=1e-12)
     # Not counted: the checkpoints' own arguments, which are details and their scale.
-    assert sum(kept[1].values()) < share * sum(kept[0].values())
+    assert sum(kept[1].values()) < 0.5 * sum(kept[0].values())
 
 
 def test_a_checkpoint_can_be_differentiated_twice() -> None:

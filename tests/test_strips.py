@@ -44,13 +44,23 @@ def test_equal_images_give_0_and_the_order_makes_no_difference(size: tuple[int, 
     assert torch.equal(metric(test, reference), metric(reference, test))
 
 
+def test_gradients_are_those_of_the_whole_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    metric = VDM()
+    test, reference = images((160, 64))
+    test.requires_grad_()
+    (gradient,) = torch.autograd.grad(metric.power(test, reference).sum(), test)
+    monkeypatch.setattr(vdm, "STRIP", 2**40)
+    (whole,) = torch.autograd.grad(metric.power(test, reference).sum(), test)
+    assert torch.equal(gradient, whole)
+    assert torch.count_nonzero(gradient) > 0
+
+
 @pytest.mark.parametrize("size", SIZES, ids=str)
-def test_gradients_are_those_of_the_whole_image(
+def test_gradients_of_checkpoints_in_strips_are_those_of_the_whole_image(
     size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     test, reference = images(size)
     test.requires_grad_()
-    # Checkpoints are computed in strips.
     loss = VDMLoss(checkpoint=True)
     (gradient,) = torch.autograd.grad(loss(test, reference), test)
     monkeypatch.setattr(vdm, "STRIP", 2**40)
