@@ -42,8 +42,11 @@ def circumstances() -> dict[str, Any]:
 
 def _arguments() -> list[str]:
     """Return the command's arguments but for where results go, on which no figure depends."""
-    words = iter(sys.argv[1:])
-    return [word for word in words if word != "--output" or next(words, "") is None]
+    words = sys.argv[1:]
+    if "--output" in words:
+        place = words.index("--output")
+        del words[place : place + 2]
+    return words
 
 
 def caption(result: dict[str, Any]) -> str:

@@ -6,6 +6,7 @@ is: they place samples. *Simulation* says how large its maximum is: it stops.
 
 import math
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -75,18 +76,7 @@ class Model:
         # Of the totals of the boundary images, once there are simulated ones to correct them by.
         self.correction: Tensor | None = None
         self.details = detail_variances(self.variance, self.true_means)
-        self.truth = self.cortex._replace(
-            details=tuple(
-                _shrunk(detail, variance)
-                for detail, variance in zip(self.cortex.details, self.details, strict=True)
-            )
-        )
-        self.textured = self.cortex._replace(
-            details=tuple(
-                _textured(detail, variance)
-                for detail, variance in zip(self.cortex.details, self.details, strict=True)
-            )
-        )
+        self.truth = self._estimated(_shrunk)
 
     def totals(self, count: NDArray[np.float64] | None = None) -> Tensor:
         """Return the total error of the finest nodes by the boundary images, (1, 1, h, w).
@@ -95,7 +85,18 @@ class Model:
         pixel so many samples.
         """
         with torch.no_grad():
-            return self._totals(self.variance if count is None else self._cone_variance(count))
+            variance = self.variance if count is None else self._cone_variance(count)
+            return self._totals(variance, self.truth)
+
+    @cached_property
+    def textured(self) -> Cortex:
+        """The image as textured as it may be; `truth` is the one as plain as it may be."""
+        return self._estimated(_textured)
+
+    def _estimated(self, estimate: Callable[[Tensor, Tensor], Tensor]) -> Cortex:
+        """Return the image with its details as estimated from them and their variances."""
+        details = map(estimate, self.cortex.details, self.details)
+        return self.cortex._replace(details=tuple(details))
 
     def shares(self) -> NDArray[np.float64]:
         """Return how much each pixel's noise adds to the largest totals, (H, W), not negative.
@@ -119,9 +120,9 @@ class Model:
         slopes = gradient.neg().clamp_min(0.0)
         return slopes / slopes.sum().clamp_min(1e-300)
 
-    def _totals(self, variance: Tensor, truth: Cortex | None = None) -> Tensor:
+    def _totals(self, variance: Tensor, truth: Cortex) -> Tensor:
         lower, upper = boundaries(
-            self.truth if truth is None else truth,
+            truth,
             detail_variances(variance, self.true_means),
             variance.mean((-2, -1), keepdim=True) / variance[0, 0].numel(),
             QUARTILE,
@@ -189,7 +190,7 @@ class Model:
         simulated totals over that of its own.
         """
         self.correction = None
-        totals = self._totals(self.variance)
+        totals = self._totals(self.variance, self.truth)
         pooled, own = (
             functional.avg_pool2d(
                 plane, 2 * SURROUNDINGS + 1, 1, SURROUNDINGS, count_include_pad=False

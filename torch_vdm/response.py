@@ -138,17 +138,14 @@ def response_difference(
 
 
 def response_difference_at(
-    details: Tensor,
-    other_details: Tensor,
-    parents: Sequence[Tensor],
-    level: Level,
-    constants: dict[str, Tensor],
-    local: bool,
-    chromatic: bool,
-    *options: Any,
+    details: Tensor, other_details: Tensor, around: tuple[Any, ...], options: tuple[Any, ...]
 ) -> Tensor:
-    """Return `response_difference` with the sight at ``parents``, given for every node."""
-    first, second = sights_of(parents, level, constants, local, chromatic)
+    """Return `response_difference` where the parents are given for every node.
+
+    ``around`` is what `sights_of` takes, ``options`` what `response` takes beside details and
+    sight.
+    """
+    first, second = sights_of(*around)
     return response_difference(details, other_details, first, second, *options)
 
 
@@ -159,21 +156,18 @@ def sights_of(
     local: bool,
     chromatic: bool,
 ) -> list[Sight]:
-    """Return `sight_at` at each of ``parents``."""
-    return [sight_at(parent, level, constants, local, chromatic) for parent in parents]
+    """Return the sight of a level at the parents of each image, fewer than its nodes.
 
-
-def sight_at(
-    parent: Tensor, level: Level, constants: dict[str, Tensor], local: bool, chromatic: bool
-) -> Sight:
-    """Return the sight of a level at its parents, of which there are fewer than nodes.
-
-    ``parent`` is their lowpass (B, 3, h, w); ``local``: in the local luminance.
+    ``parents`` are the lowpass of each, (B, 3, h, w); ``local``: in the local luminance.
     """
-    scale = level.passed / adapted(parent, constants["dark_cones"])
-    if not local:
-        return Sight(scale, level.sensitivity.unsqueeze(0))
-    return Sight(scale, sensitivity_at(parent, level, constants, chromatic))
+    sights = []
+    for parent in parents:
+        scale = level.passed / adapted(parent, constants["dark_cones"])
+        sensitivity = level.sensitivity.unsqueeze(0)
+        if local:
+            sensitivity = sensitivity_at(parent, level, constants, chromatic)
+        sights.append(Sight(scale, sensitivity))
+    return sights
 
 
 def adapted_luminance(lowpass: Tensor, constants: dict[str, Tensor]) -> Tensor:

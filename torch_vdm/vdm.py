@@ -170,7 +170,7 @@ class VDM(TiledMetric):
         )
 
     def _accumulated(self, test: Tensor, reference: Tensor) -> Tensor:
-        # Gradients need what strips drop, unless it is computed again.
+        # With gradients strips take less memory and more time, as checkpoints do.
         graph = torch.is_grad_enabled() and (test.requires_grad or reference.requires_grad)
         if (
             self.transform == Haar()
@@ -465,11 +465,15 @@ class VDM(TiledMetric):
             )
         else:
             respond = compiled(response_difference_at) if fast else response_difference_at
-            around = self._sight_options(constants)
-            difference = respond(details[0], details[1], both, level, *around, *options)
-        pooled = [self._pooled(plane) for plane in _planes(difference, sizes)]
-        summed = self._summed(_in_a_row(pooled), constants["summation_exponent"])
-        return _planes(summed, [_size(plane) for plane in pooled])
+            around = (both, level, *self._sight_options(constants))
+            difference = respond(details[0], details[1], around, options)
+        overlapping, size = self._pooling()
+        pooled = [
+            _pooled(self._surrounded(plane), overlapping, size)
+            for plane in _planes(difference, sizes)
+        ]
+        local = _summed(_in_a_row(pooled), overlapping, constants["summation_exponent"])
+        return _planes(local, [_size(plane) for plane in pooled])
 
     def _local_difference(
         self,
@@ -501,29 +505,30 @@ class VDM(TiledMetric):
             return self._gathered(difference, exponent, fast)
 
         # Where the gradient is known by hand, nothing needs to be kept.
+        fixed = *options[:2], exponent
         known = (
-            self.observer.signed
+            by_hand()
+            and self.observer.signed
             and self.effects.masking
             and self.effects.pooling
             and self.transform.csf == "levels"
             and self.transform.shifts == self.transform.phases == 1
-            and not (fast or options[0].requires_grad)
-            and not (options[1].requires_grad or exponent.requires_grad)
+            and not fast
+            and not any(constant.requires_grad for constant in fixed)
         )
         local = []
         planes = zip(details.split(at_once, 2), others.split(at_once, 2), strict=True)
         for number, (one, other) in enumerate(planes):
             some = slice(number * at_once, (number + 1) * at_once)
             arguments = one, other, sight.of(some), other_sight.of(some)
-            if known and by_hand():
-                matrix, masking = options[:2]
-                local.append(local_difference(gathered, *arguments, matrix, masking, exponent))
+            if known:
+                local.append(local_difference(gathered, *arguments, *fixed))
             else:
                 local.append(self._kept(gathered, *arguments))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]
 
     def _options(self, constants: dict[str, Tensor]) -> tuple[Tensor, Tensor, bool, bool, int]:
-        """Return what `_response` takes beside details and sight."""
+        """Return what `response` takes beside details and sight."""
         return (
             constants["opponents"],
             constants["transducer_exponent"],
@@ -534,35 +539,24 @@ class VDM(TiledMetric):
 
     def _gathered(self, difference: Tensor, exponent: Tensor, fast: bool = False) -> Tensor:
         """Return the local visual difference of response differences, after spatial pooling."""
-        if not fast:
-            return self._summed(self._pooled(difference), exponent)
-        local: Tensor
-        if self.transform.shifts == 1:
-            if not self.effects.pooling:
-                return local_visual_difference(difference, exponent)
-            local = compiled(_pooled_difference)(surround(difference), exponent)
-            return local
-        nodes = 3 if self.effects.pooling else 1
-        surrounded = surround_halves(
-            compiled(phase_energy)(difference, self.transform.phases), nodes
-        )
-        rows = compiled(pool_halves)(surrounded, nodes, -1)
-        local = compiled(_pooled_energy)(rows, nodes, exponent)
+        gather = compiled(_pooled_difference) if fast else _pooled_difference
+        local: Tensor = gather(self._surrounded(difference, fast), *self._pooling(), exponent)
         return local
 
-    def _pooled(self, difference: Tensor) -> Tensor:
-        """Return response differences after spatial pooling, as `_summed` takes them."""
-        if self.transform.shifts == 1:
-            return pool(surround(difference)) if self.effects.pooling else difference
-        nodes = 3 if self.effects.pooling else 1
-        surrounded = surround_halves(phase_energy(difference, self.transform.phases), nodes)
-        return pool_halves(pool_halves(surrounded, nodes, -1), nodes, -2)
+    def _surrounded(self, difference: Tensor, fast: bool = False) -> Tensor:
+        """Return response differences with the neighbours that `_pooled` takes."""
+        overlapping, nodes = self._pooling()
+        if not overlapping:
+            return surround(difference) if nodes > 1 else difference
+        energy = compiled(phase_energy) if fast else phase_energy
+        rows = compiled(pool_halves) if fast else pool_halves
+        surrounded = surround_halves(energy(difference, self.transform.phases), nodes)
+        pooled: Tensor = rows(surrounded, nodes, -1)
+        return pooled
 
-    def _summed(self, pooled: Tensor, exponent: Tensor) -> Tensor:
-        """Return the local visual difference of pooled response differences."""
-        if self.transform.shifts == 1:
-            return local_visual_difference(pooled, exponent)
-        return local_visual_difference_of_energy(pooled, exponent)
+    def _pooling(self) -> tuple[bool, int]:
+        """Return whether nodes overlap, and the side of what is pooled, in nodes."""
+        return self.transform.shifts > 1, 3 if self.effects.pooling else 1
 
     def _sights(
         self,
@@ -692,15 +686,27 @@ def _added(planes: list[Tensor]) -> Tensor:
     return planes[0] if len(planes) == 1 else planes[0] + planes[1]
 
 
-def _pooled_energy(surrounded: Tensor, nodes: int, exponent: Tensor) -> Tensor:
-    """Return the local visual difference of energies that are pooled along rows."""
-    return local_visual_difference_of_energy(pool_halves(surrounded, nodes, -2), exponent)
+def _pooled_difference(
+    surrounded: Tensor, overlapping: bool, nodes: int, exponent: Tensor
+) -> Tensor:
+    """Return the local visual difference of response differences, pooled."""
+    return _summed(_pooled(surrounded, overlapping, nodes), overlapping, exponent)
 
 
-def _pooled_difference(surrounded: Tensor, exponent: Tensor) -> Tensor:
-    """Return the local visual difference of response differences, pooled.
+def _pooled(surrounded: Tensor, overlapping: bool, nodes: int) -> Tensor:
+    """Return response differences pooled over ``nodes`` nodes, with their neighbours given.
 
     Printed responses are pooled as a difference, for pooling is linear; signed ones come as an
-    absolute difference, for neighbours alternate and would cancel.
+    absolute difference, for neighbours alternate and would cancel; those of overlapping nodes as
+    energies that are pooled along rows.
     """
-    return local_visual_difference(pool(surrounded), exponent)
+    if overlapping:
+        return pool_halves(surrounded, nodes, -2)
+    return pool(surrounded) if nodes > 1 else surrounded
+
+
+def _summed(pooled: Tensor, overlapping: bool, exponent: Tensor) -> Tensor:
+    """Return the local visual difference of what `_pooled` gives."""
+    if overlapping:
+        return local_visual_difference_of_energy(pooled, exponent)
+    return local_visual_difference(pooled, exponent)
