@@ -71,7 +71,17 @@ class Levels(NamedTuple):
         # For each node its level; the size is given so that nothing is read back from the device.
         counts = torch.tensor(nodes, device=self.passed.device)
         which = torch.repeat_interleave(counts, output_size=sum(nodes))
-        return Level(*(part[which].movedim(0, -1).unsqueeze(-2) for part in self))
+        # Of planes of two dimensions a selection is much faster than of those of three.
+        return Level(
+            *(
+                part.flatten(1)
+                .mT.contiguous()
+                .index_select(1, which)
+                .unflatten(0, part.shape[1:])
+                .unsqueeze(-2)
+                for part in self
+            )
+        )
 
 
 class Sight(NamedTuple):
@@ -193,4 +203,6 @@ def sensitivity_at(
     if not chromatic:
         return achromatic
     dim = torch.exp2(-constants["chromatic_dimming"] * dark)
-    return torch.cat((achromatic, level.sensitivity * dim), 1)
+    # Flat, for of planes with one channel compiled code would make a plane of channels.
+    channels = achromatic.flatten(2), (level.sensitivity * dim).flatten(2)
+    return torch.cat(channels, 1).unflatten(2, achromatic.shape[2:])

@@ -1,11 +1,13 @@
 """The visual difference metric: the stages of Fig. 2, in order. Only this file knows the order."""
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Self
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from torch_vdm.aberration import attenuation
 from torch_vdm.cones import XYZ_TO_SML, cone_responses
@@ -467,13 +469,17 @@ class VDM(TiledMetric):
             respond = compiled(response_difference_at) if fast else response_difference_at
             around = (both, level, *self._sight_options(constants))
             difference = respond(details[0], details[1], around, options)
-        overlapping, size = self._pooling()
-        pooled = [
-            _pooled(self._surrounded(plane), overlapping, size)
-            for plane in _planes(difference, sizes)
+        around = [self._surrounded(plane) for plane in _planes(difference, sizes)]
+        # Beside one another, along the shorter side of the finest.
+        along = -1 if sizes[-1][0] <= sizes[-1][1] else -2
+        gather = compiled(_pooled_difference) if fast else _pooled_difference
+        exponent = constants["summation_exponent"]
+        gathered: Tensor = gather(_joined(around, along), *self._pooling(), exponent)
+        starts = itertools.accumulate((plane.shape[along] for plane in around), initial=0)
+        return [
+            gathered.narrow(along, start, size[along])[..., : size[0], : size[1]]
+            for start, size in zip(starts, sizes, strict=False)
         ]
-        local = _summed(_in_a_row(pooled), overlapping, constants["summation_exponent"])
-        return _planes(local, [_size(plane) for plane in pooled])
 
     def _local_difference(
         self,
@@ -544,7 +550,7 @@ class VDM(TiledMetric):
         return local
 
     def _surrounded(self, difference: Tensor, fast: bool = False) -> Tensor:
-        """Return response differences with the neighbours that `_pooled` takes."""
+        """Return response differences with the neighbours that `_pooled_difference` takes."""
         overlapping, nodes = self._pooling()
         if not overlapping:
             return surround(difference) if nodes > 1 else difference
@@ -630,6 +636,20 @@ def _planes(row: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Tensor]:
     return [part.unflatten(-1, size) for part, size in zip(parts, sizes, strict=True)]
 
 
+def _joined(planes: Sequence[Tensor], along: int) -> Tensor:
+    """Return planes (..., h, w) beside one another in one, along its last or last but one side.
+
+    The other side is that of the longest; shorter ones go on with zeros.
+    """
+    lengths = [plane.shape[-3 - along] for plane in planes]
+    padded = []
+    for plane, length in zip(planes, lengths, strict=True):
+        rest = max(lengths) - length
+        sides = (0, 0, 0, rest) if along == -1 else (0, rest)
+        padded.append(functional.pad(plane, sides) if rest else plane)
+    return torch.cat(padded, along)
+
+
 def _light(image: Tensor, encoding: str, limit: Tensor | None, matrix: Tensor) -> Tensor:
     """Return the cone responses (B, 3, H, W) to an image; ``matrix`` is of linear values."""
     return cone_responses(linear_values(image, encoding, limit), matrix)
@@ -689,24 +709,12 @@ def _added(planes: list[Tensor]) -> Tensor:
 def _pooled_difference(
     surrounded: Tensor, overlapping: bool, nodes: int, exponent: Tensor
 ) -> Tensor:
-    """Return the local visual difference of response differences, pooled."""
-    return _summed(_pooled(surrounded, overlapping, nodes), overlapping, exponent)
+    """Return the local visual difference of response differences, pooled over ``nodes`` nodes.
 
-
-def _pooled(surrounded: Tensor, overlapping: bool, nodes: int) -> Tensor:
-    """Return response differences pooled over ``nodes`` nodes, with their neighbours given.
-
-    Printed responses are pooled as a difference, for pooling is linear; signed ones come as an
-    absolute difference, for neighbours alternate and would cancel; those of overlapping nodes as
-    energies that are pooled along rows.
+    Their neighbours are given. Printed responses are pooled as a difference, for pooling is
+    linear; signed ones come as an absolute difference, for neighbours alternate and would cancel;
+    those of overlapping nodes as energies that are pooled along rows.
     """
     if overlapping:
-        return pool_halves(surrounded, nodes, -2)
-    return pool(surrounded) if nodes > 1 else surrounded
-
-
-def _summed(pooled: Tensor, overlapping: bool, exponent: Tensor) -> Tensor:
-    """Return the local visual difference of what `_pooled` gives."""
-    if overlapping:
-        return local_visual_difference_of_energy(pooled, exponent)
-    return local_visual_difference(pooled, exponent)
+        return local_visual_difference_of_energy(pool_halves(surrounded, nodes, -2), exponent)
+    return local_visual_difference(pool(surrounded) if nodes > 1 else surrounded, exponent)
