@@ -24,15 +24,22 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     # Imported where it is used: it takes longer than the rest of the package.
     from torch._dynamo import config as dynamo
+    from torch._inductor import config as inductor
     from torch.fx.experimental import _config as shapes
 
     specialised = torch.compile(
         function,
         dynamic=True,
         fullgraph=True,
-        # The functions and numbers that it names do not change; to check in every call that they
-        # have not takes longer than the rest of its checks.
-        options={"guard_filter_fn": torch.compiler.skip_guard_on_globals_unsafe},
+        options={
+            # The functions and numbers that it names do not change; to check in every call that
+            # they have not takes longer than the rest of its checks.
+            "guard_filter_fn": torch.compiler.skip_guard_on_globals_unsafe,
+            # What the processor says of its vectors is believed, unless the user does not: to try
+            # them out compiles, and starts another process, for every kind. A compiler that knows
+            # torch's headers knows them.
+            "cpp.vec_isa_ok": inductor.cpp.vec_isa_ok is not False,
+        },
     )
 
     def call(*arguments: object) -> Any:

@@ -205,4 +205,5 @@ def sensitivity_at(
     dim = torch.exp2(-constants["chromatic_dimming"] * dark)
     # Flat, for of planes with one channel compiled code would make a plane of channels.
     channels = achromatic.flatten(2), (level.sensitivity * dim).flatten(2)
-    return torch.cat(channels, 1).unflatten(2, achromatic.shape[2:])
+    sensitivity: Tensor = torch.cat(channels, 1).unflatten(2, achromatic.shape[2:])
+    return sensitivity

@@ -467,8 +467,8 @@ class VDM(TiledMetric):
             )
         else:
             respond = compiled(response_difference_at) if fast else response_difference_at
-            around = (both, level, *self._sight_options(constants))
-            difference = respond(details[0], details[1], around, options)
+            seen_at = (both, level, *self._sight_options(constants))
+            difference = respond(details[0], details[1], seen_at, options)
         around = [self._surrounded(plane) for plane in _planes(difference, sizes)]
         # Beside one another, along the shorter side of the finest.
         along = -1 if sizes[-1][0] <= sizes[-1][1] else -2
