@@ -11,7 +11,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,10 @@ QUICK_SIZES = ((128, 128), (192, 256))
 
 # What a training step has.
 BATCH, PATCH = 4, (256, 256)
+
+# How often all sizes are measured in turn: their times are compared with one another, and the
+# machine changes between minutes.
+TURNS = 5
 
 Contender = Callable[[Tensor, Tensor], Tensor]
 
@@ -136,12 +140,7 @@ def run(quick: bool, output: Path | None) -> None:
     batch = (BATCH, *(QUICK_SIZES[0] if quick else PATCH))
     result["batch"] = batch
     result["batch_seconds"] = _interleaved(BACKWARD | installed, batch[1:], rounds, BATCH)
-    result["forward_seconds_by_size"] = {
-        f"{width}x{height}": _interleaved(
-            {name: FORWARD[name] for name in ("VDM", "VDM compiled")}, (height, width), rounds
-        )
-        for height, width in sizes
-    }
+    result["forward_seconds_by_size"] = _by_size(sizes, rounds, turns=1 if quick else TURNS)
     # A compiled contender costs a smoke test half a minute in each child.
     measured = [name for name in CONTENDERS if not (quick and name in COMPILED)]
     result["peak_extra_megabytes"] = {
@@ -195,6 +194,24 @@ def _interleaved(
             if number >= 2:  # the first rounds compile and fill caches
                 seconds[name].append(time.perf_counter() - start)
     return {name: statistics.median(values) for name, values in seconds.items()}
+
+
+def _by_size(
+    sizes: Sequence[tuple[int, int]], rounds: int, turns: int
+) -> dict[str, dict[str, float]]:
+    """Return the median seconds of the metric at each size, all sizes in turn."""
+    makers = {name: FORWARD[name] for name in ("VDM", "VDM compiled")}
+    seconds: dict[tuple[int, int], list[dict[str, float]]] = {size: [] for size in sizes}
+    for _ in range(turns):
+        for size in sizes:
+            seconds[size].append(_interleaved(makers, size, rounds))
+    return {
+        f"{width}x{height}": {
+            name: statistics.median(turn[name] for turn in seconds[height, width])
+            for name in makers
+        }
+        for height, width in sizes
+    }
 
 
 def _compile_times(size: tuple[int, int], names: tuple[str, ...]) -> dict[str, dict[str, float]]:

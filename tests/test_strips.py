@@ -5,8 +5,11 @@ import torch
 from torch import Tensor
 
 from torch_vdm import VDM, Observer, VDMLoss, vdm
+from torch_vdm.cortex import Haar, StationaryHaar, Steerable, Transform
 
 OBSERVERS = [Observer.calibrated(), Observer.paper()]
+
+TRANSFORMS: list[Transform] = [Haar(), StationaryHaar(), Steerable()]
 
 # Strips that divide and that do not, odd sides, an image of one strip.
 SIZES = [(160, 64), (161, 83), (299, 20), (70, 131), (5, 700)]
@@ -24,12 +27,16 @@ def images(size: tuple[int, int], batch: int = 1) -> tuple[Tensor, Tensor]:
     return reference + noise, reference
 
 
+@pytest.mark.parametrize("transform", TRANSFORMS, ids=repr)
 @pytest.mark.parametrize("observer", OBSERVERS, ids=lambda o: o.name)
 @pytest.mark.parametrize("size", SIZES, ids=str)
 def test_strips_give_the_map_of_the_whole(
-    size: tuple[int, int], observer: Observer, monkeypatch: pytest.MonkeyPatch
+    size: tuple[int, int],
+    observer: Observer,
+    transform: Transform,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    metric = VDM(observer=observer)
+    metric = VDM(observer=observer, transform=transform)
     test, reference = images(size, batch=2)
     in_strips = metric(test, reference)
     monkeypatch.setattr(vdm, "STRIP", 2**40)

@@ -10,6 +10,7 @@ from torch.utils.checkpoint import checkpoint
 
 from torch_vdm.display import Display
 from torch_vdm.distance import just_noticeable
+from torch_vdm.memory import keep_freed_memory
 
 Nonfinite = Literal["raise", "mask"]
 
@@ -125,6 +126,8 @@ class PairMetric(nn.Module):
         return {name: value.to(dtype) for name, value in buffers.items()}
 
     def _total(self, test: Tensor, reference: Tensor) -> Tensor:
+        if not torch.compiler.is_compiling():
+            keep_freed_memory()
         totals = [self._accumulated(one, other) for one, other in self._parts(test, reference)]
         return torch.cat(totals)
 

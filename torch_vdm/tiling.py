@@ -107,13 +107,15 @@ class Tiling:
         return cls(size, (side, side), levels, halo)
 
     @classmethod
-    def strips(cls, size: tuple[int, int], pixels: int, levels: int, nodes: int) -> "Tiling":
+    def strips(
+        cls, size: tuple[int, int], pixels: int, levels: int, shifts: int, nodes: int
+    ) -> "Tiling":
         """Return a tiling by strips as wide as the image, of about as many pixels.
 
-        For nodes that lie side by side; ``levels`` and ``nodes`` as in `fit`.
+        ``levels``, ``shifts`` and ``nodes`` as in `fit`.
         """
         parent = 2 ** (levels + 1)
-        halo = -(-nodes // 2) * parent
+        halo = -(-nodes // (2 * shifts)) * parent
         # No thinner than so many halos, which are computed twice.
         rows = max(pixels // (size[1] * parent) * parent, 4 * halo)
         return cls(size, (rows, size[1]), levels, halo)

@@ -175,42 +175,45 @@ class VDM(TiledMetric):
         # With gradients strips take less memory and more time, as checkpoints do.
         graph = torch.is_grad_enabled() and (test.requires_grad or reference.requires_grad)
         if (
-            self.transform == Haar()
+            self.transform.csf == "levels"
             and math.prod(_size(test)) >= 2 * STRIP
             and not torch.compiler.is_compiling()
             and (self._checkpointed or not graph)
         ):
-            return self._accumulated_in_strips(test, reference, self.transform)
+            return self._accumulated_in_strips(test, reference)
         return self.compare(self.represent(test), self.represent(reference))
 
-    def _accumulated_in_strips(self, test: Tensor, reference: Tensor, haar: Haar) -> Tensor:
+    def _accumulated_in_strips(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the same of large images, the finest levels strip by strip.
 
         A strip stays in the processor's cache, and its memory is used again for the next one, where
         whole planes would be asked from the system anew in every call.
         """
-        size, octaves = _size(test), STRIP_LEVELS
+        size, count = _size(test), STRIP_LEVELS + 1
+        transform, shifts = self.transform, self.transform.shifts
         options = self._fast, self.observer.true_means
         constants = self._constants(test.dtype)
         # One level more than are computed, for the parents of the last.
-        levels = self._levels(0, octaves + 1, constants)
-        tiling = Tiling.strips(size, STRIP, octaves, haar.reach + 1)
+        levels = self._levels(0, count, constants)
+        pooled = 2 * shifts - 1
+        tiling = Tiling.strips(size, STRIP, STRIP_LEVELS, shifts, transform.reach + pooled)
+        octaves = count - shifts
 
         def strip_of(strip: Tile, one: Tensor, other: Tensor) -> list[Tensor]:
-            """Return the means of nodes and rows of two images, and what their levels add."""
+            """Return the bases and rows of two images, and what their levels add."""
             parts: list[Tensor] = []
             strips: list[Cortex] = []
             for image in (one, other):
                 cones = self._cone_planes(image)
-                cortex = haar.begin(cones, octaves + 1, *options)
+                cortex, base = transform.begin(cones, count, *options)
                 rows = cones.mean(-1, keepdim=True)
-                parts.append(cut(cortex.lowpass[1], strip.within(2**octaves)))
+                parts.append(cut(base.plane, strip.within(2**base.octaves)))
                 parts.append(cut(rows, (strip.within(1)[0], slice(None))))
                 strips.append(cortex)
-            for number in range(1, octaves + 1):
+            for number in range(1, count):
                 level = levels.only(number)
                 local = self._local_difference(strips[0], strips[1], number, level, constants)
-                node = 2 ** (octaves + 1 - number)
+                node = 2 ** (count - number) // shifts
                 parts.append(cut(local, strip.within(node)))
             return parts
 
@@ -220,12 +223,12 @@ class VDM(TiledMetric):
                 tiling, *(tiling.split_rows(image) for image in (test, reference)), strict=True
             )
         ]
-        first_means, first_rows, second_means, second_rows, *fine = (
+        first_plane, first_rows, second_plane, second_rows, *fine = (
             torch.cat(parts, -2) for parts in zip(*pieces, strict=True)
         )
         first, second = (
-            haar.coarser(Base(means, octaves, size, mean_of(rows)), *options)
-            for means, rows in ((first_means, first_rows), (second_means, second_rows))
+            transform.rest(Base(plane, octaves, size, mean_of(rows)), *options)
+            for plane, rows in ((first_plane, first_rows), (second_plane, second_rows))
         )
         coarse, root = self._differences(first, second)
         return accumulate([*coarse, *fine], root)

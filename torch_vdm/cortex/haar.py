@@ -62,10 +62,16 @@ class Haar:
 
     def begin(
         self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
-    ) -> Cortex:
-        """Return the ``count`` finest levels of `decompose`, without a mean; arguments as there."""
+    ) -> tuple[Cortex, Base]:
+        """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
         size = (planes.shape[-2], planes.shape[-1])
-        return self.coarser(Base(planes, 0, size, planes[..., :1, :1]), fast, true_means, count)
+        base = Base(planes, 0, size, planes[..., :1, :1])
+        cortex = self.coarser(base, fast, true_means, count)
+        return cortex, base._replace(plane=cortex.lowpass[1], octaves=count - 1)
+
+    def rest(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
+        """Return the coarser levels; see `Transform.rest`."""
+        return self.coarser(base, fast, true_means)
 
     def reduced(
         self, planes: Tensor, octaves: int, fast: bool = False, true_means: bool = False

@@ -74,6 +74,21 @@ class StationaryHaar:
             return Cortex((), (planes,), mean)
         return _cortex(parts, 0, size, mean, fast, true_means)
 
+    def begin(
+        self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
+    ) -> tuple[Cortex, Base]:
+        """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
+        size = (planes.shape[-2], planes.shape[-1])
+        octaves = count - 2
+        _, means = levels(planes, 1, size, fast, true_means, octaves)
+        none = planes[..., :1, :1]
+        cortex = _cortex([planes, planes, *means], 0, size, none, fast, true_means)
+        return cortex, Base(means[-1], octaves, size, none)
+
+    def rest(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
+        """Return the coarser levels; see `Transform.rest`."""
+        return self.resume(base, fast, true_means)
+
     def reduced(
         self, planes: Tensor, octaves: int, fast: bool = False, true_means: bool = False
     ) -> Tensor:

@@ -83,6 +83,21 @@ class Steerable:
         band = _doubled(_doubled(planes, -1), -2)
         return self._cortex(planes, band - blur(band, fast), 0, mean, fast)
 
+    def begin(
+        self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
+    ) -> tuple[Cortex, Base]:
+        """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
+        size = (planes.shape[-2], planes.shape[-1])
+        none = planes[..., :1, :1]
+        band = _doubled(_doubled(planes, -1), -2)
+        cortex = self._cortex(planes, band - blur(band, fast), 0, none, fast, count)
+        reduced = self.reduced(planes, count - 2, fast, true_means)
+        return cortex, Base(reduced, count - 2, size, none)
+
+    def rest(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
+        """Return the coarser levels; see `Transform.rest`."""
+        return self.resume(base, fast, true_means)
+
     def reduced(
         self,
         planes: Tensor,
@@ -106,11 +121,23 @@ class Steerable:
         band = base.plane - smooth
         return self._cortex(_dropped(smooth), band, base.octaves + 1, base.mean, fast)
 
-    def _cortex(self, plane: Tensor, band: Tensor, finest: int, mean: Tensor, fast: bool) -> Cortex:
-        """Return the levels from ``finest`` on, of its plane and the band that it is made of."""
+    def _cortex(
+        self,
+        plane: Tensor,
+        band: Tensor,
+        finest: int,
+        mean: Tensor,
+        fast: bool,
+        count: int = DEEPEST,
+    ) -> Cortex:
+        """Return the levels from ``finest`` on, of its plane and the band that it is made of.
+
+        At most ``count``.
+        """
         details: list[Tensor] = []
         lowpass: list[Tensor] = []
-        for level in range(finest, finest + (max(plane.shape[-2:]) - 1).bit_length()):
+        all_levels = (max(plane.shape[-2:]) - 1).bit_length()
+        for level in range(finest, finest + min(all_levels, count)):
             size = (plane.shape[-2], plane.shape[-1])
             # The nodes lie between those of the next finer level: at the odd ones of the doubled
             # image, the even ones but the first of all others.

@@ -115,6 +115,20 @@ class Transform(Protocol):
         From what `reduced` gives, so that an image larger than memory is decomposed in tiles.
         """
 
+    def begin(
+        self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
+    ) -> tuple[Cortex, Base]:
+        """Return the ``count`` finest levels of `decompose`, 3 or more, and what `rest` needs.
+
+        So that a large image is decomposed in strips. The mean in both is none.
+        """
+
+    def rest(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
+        """Return the levels of `decompose` without its ``count`` - 1 finest, for `begin`'s base.
+
+        That base put together from those of all strips, with the image's own size and mean.
+        """
+
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there.
 
