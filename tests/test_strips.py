@@ -9,7 +9,13 @@ from torch_vdm.cortex import Haar, StationaryHaar, Steerable, Transform
 
 OBSERVERS = [Observer.calibrated(), Observer.paper()]
 
-TRANSFORMS: list[Transform] = [Haar(), StationaryHaar(), Steerable()]
+TRANSFORMS: list[Transform] = [
+    Haar(),
+    StationaryHaar(),
+    Steerable(),
+    Haar("filter"),
+    StationaryHaar("filter"),
+]
 
 # Strips that divide and that do not, odd sides, an image of one strip.
 SIZES = [(160, 64), (161, 83), (299, 20), (70, 131), (5, 700)]

@@ -175,8 +175,7 @@ class VDM(TiledMetric):
         # With gradients strips take less memory and more time, as checkpoints do.
         graph = torch.is_grad_enabled() and (test.requires_grad or reference.requires_grad)
         if (
-            self.transform.csf == "levels"
-            and math.prod(_size(test)) >= 2 * STRIP
+            math.prod(_size(test)) >= 2 * STRIP
             and not torch.compiler.is_compiling()
             and (self._checkpointed or not graph)
         ):
@@ -198,15 +197,21 @@ class VDM(TiledMetric):
         pooled = 2 * shifts - 1
         tiling = Tiling.strips(size, STRIP, STRIP_LEVELS, shifts, transform.reach + pooled)
         octaves = count - shifts
+        filtered = transform.csf == "filter"
+        sources, means = [test, reference], None
+        if filtered:  # which needs the image whole
+            cones = [self._cone_planes(image) for image in sources]
+            sources = [self._weighted_contrast(planes) for planes in cones]
+            means = [mean_of(planes) for planes in cones]
 
         def strip_of(strip: Tile, one: Tensor, other: Tensor) -> list[Tensor]:
             """Return the bases and rows of two images, and what their levels add."""
             parts: list[Tensor] = []
             strips: list[Cortex] = []
             for image in (one, other):
-                cones = self._cone_planes(image)
-                cortex, base = transform.begin(cones, count, *options)
-                rows = cones.mean(-1, keepdim=True)
+                planes = image if filtered else self._cone_planes(image)
+                cortex, base = transform.begin(planes, count, *options)
+                rows = planes.mean(-1, keepdim=True)
                 parts.append(cut(base.plane, strip.within(2**base.octaves)))
                 parts.append(cut(rows, (strip.within(1)[0], slice(None))))
                 strips.append(cortex)
@@ -220,15 +225,19 @@ class VDM(TiledMetric):
         pieces = [
             strip_of(strip, *around)
             for strip, *around in zip(
-                tiling, *(tiling.split_rows(image) for image in (test, reference)), strict=True
+                tiling, *(tiling.split_rows(source) for source in sources), strict=True
             )
         ]
         first_plane, first_rows, second_plane, second_rows, *fine = (
             torch.cat(parts, -2) for parts in zip(*pieces, strict=True)
         )
         first, second = (
-            transform.rest(Base(plane, octaves, size, mean_of(rows)), *options)
-            for plane, rows in ((first_plane, first_rows), (second_plane, second_rows))
+            transform.rest(Base(plane, octaves, size, mean), *options)
+            for plane, mean in zip(
+                (first_plane, second_plane),
+                means or [mean_of(rows) for rows in (first_rows, second_rows)],
+                strict=True,
+            )
         )
         coarse, root = self._differences(first, second)
         return accumulate([*coarse, *fine], root)
