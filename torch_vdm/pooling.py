@@ -6,8 +6,7 @@ from torch.nn import functional
 
 def surround(responses: Tensor) -> Tensor:
     """Repeat the border of (B, channels, orientations, h, w) once on every side."""
-    padded = functional.pad(responses.flatten(1, 2), (1, 1, 1, 1), mode="replicate")
-    return padded.view(*responses.shape[:3], *padded.shape[2:])
+    return functional.pad(responses, (1, 1, 1, 1, 0, 0), mode="replicate")
 
 
 def pool(surrounded: Tensor) -> Tensor:
@@ -33,9 +32,8 @@ def phase_energy(responses: Tensor, phases: int) -> Tensor:
 
 def surround_halves(energy: Tensor, nodes: int) -> Tensor:
     """Repeat the border as `pool_halves` needs, over ``nodes`` nodes."""
-    sides = (nodes, nodes - 1, nodes, nodes - 1)
-    padded = functional.pad(energy.flatten(1, 2), sides, mode="replicate")
-    return padded.view(*energy.shape[:3], *padded.shape[2:])
+    sides = (nodes, nodes - 1, nodes, nodes - 1, 0, 0)
+    return functional.pad(energy, sides, mode="replicate")
 
 
 def pool_halves(surrounded: Tensor, nodes: int, dim: int) -> Tensor:

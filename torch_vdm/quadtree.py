@@ -83,15 +83,16 @@ def _means(plane: Tensor, axis: int, real: float) -> Tensor:
 def push(nodes: Tensor, size: tuple[int, int]) -> Tensor:
     """Give every child on a plane of ``size`` = (h, w) the value of its parent.
 
-    ``nodes`` is (B, C, ceil(h / 2), ceil(w / 2)); the root's plane, 1 x 1, is also its own
+    ``nodes`` is (B, C, ..., ceil(h / 2), ceil(w / 2)); the root's plane, 1 x 1, is also its own
     parent plane.
     """
     if nodes.numel() <= SMALL and nodes.is_floating_point():
-        flat = nodes if nodes.ndim == 4 else nodes.flatten(1, -3)
-        plane = functional.interpolate(flat, scale_factor=2.0)
-        children = plane.view(*nodes.shape[:-2], *plane.shape[-2:])
-        return children[..., : size[0], : size[1]].contiguous()
-    # Columns, then rows: faster than repeating elements along one side and the other.
-    rows = torch.stack((nodes, nodes), -1).flatten(-2).unsqueeze(-2)
-    children = rows.expand(*rows.shape[:-2], 2, rows.shape[-1]).flatten(-3, -2)
+        twice = (*[1.0] * (nodes.ndim - 4), 2.0, 2.0)
+        children = functional.interpolate(nodes, scale_factor=twice)
+    else:
+        # Columns, then rows: faster than repeating elements along one side and the other.
+        rows = torch.stack((nodes, nodes), -1).flatten(-2).unsqueeze(-2)
+        children = rows.expand(*rows.shape[:-2], 2, rows.shape[-1]).flatten(-3, -2)
+    if (children.shape[-2], children.shape[-1]) == size:
+        return children  # no view, on which compiled code would be specialised
     return children[..., : size[0], : size[1]].contiguous()

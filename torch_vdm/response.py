@@ -63,7 +63,7 @@ class Levels(NamedTuple):
 
     def only(self, number: int) -> Level:
         """Return one level."""
-        # Copies, for compiled code is specialised on the offset of a view.
+        # Copies, for compiled code is specialised on views and their offsets.
         return Level(*(part[number, ..., None, None].clone() for part in self))
 
     def in_a_row(self, nodes: Sequence[int]) -> Level:
@@ -71,7 +71,8 @@ class Levels(NamedTuple):
         # For each node its level; the size is given so that nothing is read back from the device.
         counts = torch.tensor(nodes, device=self.passed.device)
         which = torch.repeat_interleave(counts, output_size=sum(nodes))
-        # Of planes of two dimensions a selection is much faster than of those of three.
+        # Of planes of two dimensions a selection is much faster than of those of three. Copies, as
+        # in `only`.
         return Level(
             *(
                 part.flatten(1)
@@ -79,6 +80,7 @@ class Levels(NamedTuple):
                 .index_select(1, which)
                 .unflatten(0, part.shape[1:])
                 .unsqueeze(-2)
+                .clone()
                 for part in self
             )
         )

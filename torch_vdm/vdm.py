@@ -535,7 +535,12 @@ class VDM(TiledMetric):
             and not any(constant.requires_grad for constant in fixed)
         )
         local = []
-        planes = zip(details.split(at_once, 2), others.split(at_once, 2), strict=True)
+        # Itself where it is not cut, for compiled code is specialised on views.
+        parts, other_parts = (
+            (plane,) if at_once == orientations else plane.split(at_once, 2)
+            for plane in (details, others)
+        )
+        planes = zip(parts, other_parts, strict=True)
         for number, (one, other) in enumerate(planes):
             some = slice(number * at_once, (number + 1) * at_once)
             arguments = one, other, sight.of(some), other_sight.of(some)
@@ -639,7 +644,7 @@ def _size(plane: Tensor) -> tuple[int, int]:
 
 def _in_a_row(planes: Iterable[Tensor]) -> Tensor:
     """Return the nodes of planes (..., h, w) in a row, (..., 1, all of them)."""
-    return torch.cat([plane.flatten(-2) for plane in planes], -1).unsqueeze(-2)
+    return torch.cat([plane.flatten(-2).unsqueeze(-2) for plane in planes], -1)
 
 
 def _planes(row: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Tensor]:
