@@ -24,6 +24,7 @@ from torch import Tensor
 
 from benchmarks import record
 from benchmarks.calibrate import HIGHEST_CONTRAST, MECHANISMS, by_mechanism, centred
+from benchmarks.daly import PSYCHOMETRIC, detection_probability
 from benchmarks.peers import Peer, clipped, installed
 from benchmarks.places import shared_data
 from benchmarks.speed import images, peak_megabytes
@@ -46,6 +47,9 @@ CYCLE, PHASE = 8.0, 0.4
 
 # Values below this are none. Status: choice.
 SMALLEST = 1e-12
+
+# A probability of 1 counts as the largest number below it.
+SUREST = 1.0 - 2.0**-53
 
 # The grating experiments: pixels/degree, cycles/degree, phases, light of white in cd/m2.
 PPD, WHITE = 64.0, 200.0
@@ -93,6 +97,20 @@ def sarnoff(tests: Tensor, reference: Tensor, ppd: float) -> Tensor:
     return torch.stack((flat.mean(1), flat.amax(1)), 1)
 
 
+def daly(tests: Tensor, reference: Tensor, ppd: float) -> Tensor:
+    """Return what Daly's probabilities of detection come to, as `Peer.values`.
+
+    At the pixel where it is largest, and over all pixels together, each as the contrast of its
+    psychometric function, which tells probabilities near 1 apart.
+    """
+    figures = []
+    for test in tests.split(1):
+        seen = detection_probability(test, reference, ppd, Display.xyz())
+        missed = -torch.log1p(-seen.clamp_max(SUREST))
+        figures.append(torch.stack((missed.amax(), missed.sum())))
+    return torch.stack(figures) ** (1.0 / PSYCHOMETRIC)
+
+
 def contenders() -> dict[str, Any]:
     """Return everything of ours that is judged by human thresholds."""
     without = {
@@ -103,6 +121,7 @@ def contenders() -> dict[str, Any]:
         **{name: ours(transform=transform) for name, transform in (RUNGS | FILTERS).items()},
         "paper's observer": ours(observer=Observer.paper()),
         "Sarnoff": sarnoff,
+        "Daly": daly,
         **without,
         "fast, float64": ours(torch.float64),
         "fast, bfloat16 autocast": ours(autocast=True),

@@ -125,3 +125,18 @@ def test_functional_transforms_take_autograds_way() -> None:
     tangent = torch.ones_like(test)
     change = torch.func.jvp(total, (test,), (tangent,))[1]
     torch.testing.assert_close(change, (plain * tangent).sum())
+
+
+def test_vmap_gives_every_item_its_own_map_and_gradient() -> None:
+    test, reference = noise((12, 9))
+    loss = VDMLoss(nonfinite="mask")
+
+    def of_one(one: Tensor, other: Tensor) -> Tensor:
+        return loss(one[None], other[None])
+
+    gradients = torch.vmap(torch.func.grad(of_one))(test, reference)
+    for one, other, gradient in zip(test, reference, gradients, strict=True):
+        torch.testing.assert_close(torch.func.grad(of_one)(one, other), gradient)
+    metric = VDM(nonfinite="mask")
+    maps = torch.vmap(lambda one, other: metric(one[None], other[None])[0])(test, reference)
+    torch.testing.assert_close(maps, metric(test, reference))

@@ -15,7 +15,7 @@ def keep_freed_memory() -> None:
 
     Glibc gives freed memory back to the system above twice the largest block that it has seen
     freed. Of images of 0.1 to 1 megapixels all of a call's memory is above that, and the next call
-    gets it anew, page by page: up to a fifth of its time. The block here is never written to, so
-    it takes no memory itself; other C libraries do not mind it.
+    gets it anew, page by page. The block here is never written to, so it takes no memory itself;
+    other C libraries do not mind it.
     """
     torch.empty(LARGEST_LEARNED, dtype=torch.uint8, device="cpu")

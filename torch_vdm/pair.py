@@ -47,6 +47,7 @@ class PairMetric(nn.Module):
         self.nonfinite = nonfinite
         self._fast = False
         self._checkpointed = False
+        keep_freed_memory()
 
     def _kept(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a part of the forward pass, of which a checkpoint keeps the arguments alone.
@@ -126,8 +127,6 @@ class PairMetric(nn.Module):
         return {name: value.to(dtype) for name, value in buffers.items()}
 
     def _total(self, test: Tensor, reference: Tensor) -> Tensor:
-        if not torch.compiler.is_compiling():
-            keep_freed_memory()
         totals = [self._accumulated(one, other) for one, other in self._parts(test, reference)]
         return torch.cat(totals)
 
