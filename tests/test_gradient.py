@@ -132,7 +132,8 @@ def test_vmap_gives_every_item_its_own_map_and_gradient() -> None:
     loss = VDMLoss(nonfinite="mask")
 
     def of_one(one: Tensor, other: Tensor) -> Tensor:
-        return loss(one[None], other[None])
+        value: Tensor = loss(one[None], other[None])
+        return value
 
     gradients = torch.vmap(torch.func.grad(of_one))(test, reference)
     for one, other, gradient in zip(test, reference, gradients, strict=True):
