@@ -17,8 +17,8 @@ TRANSFORMS: list[Transform] = [
     StationaryHaar("filter"),
 ]
 
-# Strips that divide and that do not, odd sides, an image of one strip.
-SIZES = [(160, 64), (161, 83), (299, 20), (70, 131), (5, 700)]
+# Strips that divide and that do not, odd sides, an image of one strip, lines.
+SIZES = [(160, 64), (161, 83), (299, 20), (70, 131), (5, 700), (2100, 1), (1, 2100)]
 
 
 @pytest.fixture(autouse=True)

@@ -482,7 +482,7 @@ class VDM(TiledMetric):
             seen_at = (both, level, *self._sight_options(constants))
             difference = respond(details[0], details[1], seen_at, options)
         around = [self._surrounded(plane) for plane in _planes(difference, sizes)]
-        # Beside one another, along the shorter side of the finest.
+        # Beside one another along the longer side, where the least is left to fill up.
         along = -1 if sizes[-1][0] <= sizes[-1][1] else -2
         gather = compiled(_pooled_difference) if fast else _pooled_difference
         exponent = constants["summation_exponent"]
