@@ -6,7 +6,6 @@ the system has not written out yet, everything.
 """
 
 import json
-import resource
 import sys
 import tempfile
 import time
@@ -17,6 +16,7 @@ import numpy as np
 import torch
 
 from benchmarks.record import blank_figure, caption, circumstances, measured_apart, save
+from benchmarks.speed import status
 from torch_vdm import VDM, Haar, StationaryHaar, Steerable
 from torch_vdm.cortex import Transform
 from torch_vdm.io import ArrayFile
@@ -90,9 +90,9 @@ def _measure(what: str, folder: Path, accuracy: str, tile: int) -> dict[str, flo
     start, cpu = time.perf_counter(), time.process_time()
     metric.tiled(test, reference, tile, jnd)
     seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - cpu
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     if what == "tiles":
-        return {"peak_bytes": peak, "seconds": seconds, "cpu_seconds": cpu_seconds}
+        # Not getrusage's: a process inherits that of the one that began it.
+        return {"peak_bytes": 1e3 * status("VmHWM"), "seconds": seconds, "cpu_seconds": cpu_seconds}
     scale = np.float32(255.0)
     images = (torch.from_numpy(image[:, :, :] / scale).unsqueeze(0) for image in (test, reference))
     with torch.no_grad():

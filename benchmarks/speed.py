@@ -254,13 +254,13 @@ def _measure(what: str, name: str, size: tuple[int, int]) -> dict[str, float]:
 def peak_megabytes(call: Callable[[], object]) -> float:
     """Return the memory that a call takes at most over what the process had before, in MB."""
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-    before = _status("VmRSS")
+    before = status("VmRSS")
     call()
-    return (_status("VmHWM") - before) / 1e3
+    return (status("VmHWM") - before) / 1e3
 
 
-def _status(field: str) -> float:
-    """Return a field of /proc/self/status in kilobytes."""
+def status(field: str) -> float:
+    """Return a field of /proc/self/status in kilobytes of 1000 bytes."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(field):
             return float(line.split()[1]) * 1.024
