@@ -13,7 +13,7 @@ from torch import Tensor
 from tests.conftest import KINDS, make_xyz, reference_numbers
 from tests.reference import calibrated, transforms
 from tests.reference.paper import cone_fundamentals
-from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, VDMLoss
+from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, VDMLoss, vdm
 from torch_vdm.cortex import Transform, bands
 
 PPD = 64.0
@@ -33,6 +33,22 @@ each_observer = pytest.mark.parametrize(
 )
 each_filtered = pytest.mark.parametrize("transform", FILTERED, ids=name)
 each_overlapping = pytest.mark.parametrize("transform", OVERLAPPING, ids=name)
+
+
+@each
+@each_observer
+@pytest.mark.parametrize("size", [(37, 5), (5, 37), (33, 32)], ids=str)
+def test_levels_at_once_are_levels_one_by_one(
+    size: tuple[int, int],
+    observer: Observer,
+    transform: Transform,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    metric = VDM(PPD, observer=observer, transform=transform)
+    test, reference = (random_images(seed, 2, *size).double() for seed in (1, 2))
+    at_once = metric(test, reference)
+    monkeypatch.setattr(vdm, "FEW_NODES", 0)
+    torch.testing.assert_close(at_once, metric(test, reference), rtol=1e-12, atol=1e-12)
 
 
 def random_images(seed: int, batch: int = 1, height: int = 24, width: int = 31) -> Tensor:

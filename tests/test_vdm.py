@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tests.conftest import KINDS, make_xyz, reference_numbers
 from tests.reference import calibrated, paper
-from torch_vdm import VDM, Display, Effects, Observer
+from torch_vdm import VDM, Display, Effects, Observer, vdm
 
 PPD = 48.0
 EFFECTS = [Effects(*switches) for switches in itertools.product((True, False), repeat=4)]
@@ -183,6 +183,21 @@ def test_the_fast_route_is_never_compiled_again() -> None:
     for shape in ((1, 64, 64), (3, 33, 80), (2, 80, 33), (1, 101, 47), (5, 40, 56), (1, 16, 700)):
         call(*shape)
         assert counters["stats"]["unique_graphs"] == graphs, shape
+
+
+def test_large_images_compile_nothing_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Levels one by one and strips, of sides that are even at every level, and that are not.
+    from torch._dynamo.utils import counters
+
+    monkeypatch.setattr(vdm, "FEW_NODES", 300)
+    monkeypatch.setattr(vdm, "STRIP", 2048)
+    fast = VDM().compile()
+    with torch.no_grad():
+        fast(*images(1, 64, 64))
+        graphs = counters["stats"]["unique_graphs"]
+        for shape in ((1, 61, 67), (1, 192, 64), (1, 203, 67), (2, 160, 80)):
+            fast(*images(*shape))
+            assert counters["stats"]["unique_graphs"] == graphs, shape
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
