@@ -205,14 +205,14 @@ class VDM(TiledMetric):
             means = [mean_of(planes) for planes in cones]
 
         def strip_of(strip: Tile, one: Tensor, other: Tensor) -> list[Tensor]:
-            """Return the bases and rows of two images, and what their levels add."""
+            """Return what the rest needs and rows of two images, and what their levels add."""
             parts: list[Tensor] = []
             strips: list[Cortex] = []
             for image in (one, other):
                 planes = image if filtered else self._cone_planes(image)
-                cortex, base = transform.begin(planes, count, *options)
+                cortex, reduced = transform.begin(planes, count, *options)
                 rows = planes.mean(-1, keepdim=True)
-                parts.append(cut(base.plane, strip.within(2**base.octaves)))
+                parts.append(cut(reduced, strip.within(2**octaves)))
                 parts.append(cut(rows, (strip.within(1)[0], slice(None))))
                 strips.append(cortex)
             for number in range(1, count):

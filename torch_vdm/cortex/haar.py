@@ -62,12 +62,12 @@ class Haar:
 
     def begin(
         self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
-    ) -> tuple[Cortex, Base]:
+    ) -> tuple[Cortex, Tensor]:
         """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
         size = (planes.shape[-2], planes.shape[-1])
         base = Base(planes, 0, size, planes[..., :1, :1])
         cortex = self.coarser(base, fast, true_means, count)
-        return cortex, base._replace(plane=cortex.lowpass[1], octaves=count - 1)
+        return cortex, cortex.lowpass[1]
 
     def rest(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
         """Return the coarser levels; see `Transform.rest`."""

@@ -76,14 +76,12 @@ class StationaryHaar:
 
     def begin(
         self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
-    ) -> tuple[Cortex, Base]:
+    ) -> tuple[Cortex, Tensor]:
         """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
         size = (planes.shape[-2], planes.shape[-1])
-        octaves = count - 2
-        _, means = levels(planes, 1, size, fast, true_means, octaves)
-        none = planes[..., :1, :1]
-        cortex = _cortex([planes, planes, *means], 0, size, none, fast, true_means)
-        return cortex, Base(means[-1], octaves, size, none)
+        _, means = levels(planes, 1, size, fast, true_means, count - 2)
+        parts = [planes, planes, *means]
+        return _cortex(parts, 0, size, planes[..., :1, :1], fast, true_means), means[-1]
 
     def rest(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
         """Return the coarser levels; see `Transform.rest`."""

@@ -85,14 +85,12 @@ class Steerable:
 
     def begin(
         self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
-    ) -> tuple[Cortex, Base]:
+    ) -> tuple[Cortex, Tensor]:
         """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
-        size = (planes.shape[-2], planes.shape[-1])
-        none = planes[..., :1, :1]
         band = _doubled(_doubled(planes, -1), -2)
+        none = planes[..., :1, :1]
         cortex = self._cortex(planes, band - blur(band, fast), 0, none, fast, count)
-        reduced = self.reduced(planes, count - 2, fast, true_means)
-        return cortex, Base(reduced, count - 2, size, none)
+        return cortex, self.reduced(planes, count - 2, fast, true_means)
 
     def rest(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
         """Return the coarser levels; see `Transform.rest`."""
@@ -103,7 +101,7 @@ class Steerable:
         planes: Tensor,
         octaves: int,
         fast: bool = False,
-        true_means: bool = False,  # noqa: ARG002
+        true_means: bool = False,  # noqa: ARG002  # as in `decompose`
     ) -> Tensor:
         """Return the Gaussian pyramid's plane; arguments as `decompose`."""
         for _ in range(octaves):

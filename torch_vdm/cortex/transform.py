@@ -117,16 +117,17 @@ class Transform(Protocol):
 
     def begin(
         self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
-    ) -> tuple[Cortex, Base]:
+    ) -> tuple[Cortex, Tensor]:
         """Return the ``count`` finest levels of `decompose`, 3 or more, and what `rest` needs.
 
-        So that a large image is decomposed in strips. The mean in both is none.
+        That is the image at 1 / 2^(count - shifts) of its sides. So a large image is decomposed in
+        strips; a strip's mean is none.
         """
 
     def rest(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
-        """Return the levels of `decompose` without its ``count`` - 1 finest, for `begin`'s base.
+        """Return the levels of `decompose` without its ``count`` - 1 finest.
 
-        That base put together from those of all strips, with the image's own size and mean.
+        The plane of ``base`` is put together from those that `begin` gives of all strips.
         """
 
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
