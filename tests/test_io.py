@@ -450,7 +450,7 @@ def test_unknown_policies_are_refused(tmp_path: Path, options: dict[str, Any]) -
 def test_an_image_does_not_change(tmp_path: Path) -> None:
     image = load(write_exr(tmp_path / "image.exr", rgb(planes())))
     with pytest.raises(FrozenInstanceError):
-        image.linear = False  # type: ignore[misc]
+        image.linear = False  # type: ignore[misc]  # wrong on purpose
 
 
 # --- PNG and JPEG ---------------------------------------------------------------------------------

@@ -66,7 +66,7 @@ def test_one_figure_is_a_tensor_that_a_logger_takes(figure: Literal["mean_jnd"])
     assert isinstance(alone, Tensor)
     assert torch.equal(alone, found[figure])
     with pytest.raises(ValueError, match="mean_jnd, max_jnd, visible_fraction"):
-        VisualDifference(figure="median")  # type: ignore[arg-type]
+        VisualDifference(figure="median")  # type: ignore[arg-type]  # wrong on purpose
 
 
 def test_no_graph_is_kept() -> None:

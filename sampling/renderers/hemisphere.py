@@ -37,7 +37,7 @@ def register(mi: Any, dr: Any) -> None:
             self,
             context: Any,
             surface: Any,
-            sample1: Any,  # noqa: ARG002
+            sample1: Any,  # noqa: ARG002  # Mitsuba's signature
             sample2: Any,
             active: Any = True,
         ) -> tuple[Any, Any]:
@@ -53,7 +53,7 @@ def register(mi: Any, dr: Any) -> None:
 
         def eval(
             self,
-            context: Any,  # noqa: ARG002
+            context: Any,  # noqa: ARG002  # Mitsuba's signature
             surface: Any,
             outwards: Any,
             active: Any = True,
@@ -65,7 +65,7 @@ def register(mi: Any, dr: Any) -> None:
 
         def pdf(
             self,
-            context: Any,  # noqa: ARG002
+            context: Any,  # noqa: ARG002  # Mitsuba's signature
             surface: Any,
             outwards: Any,
             active: Any = True,
