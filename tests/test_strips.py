@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from torch_vdm import VDM, Observer, VDMLoss, vdm
-from torch_vdm.cortex import Haar, StationaryHaar, Steerable, Transform
+from torch_vdm.cortex import Haar, StationaryHaar, Steerable, Transform, bands
 
 OBSERVERS = [Observer.calibrated(), Observer.paper()]
 
@@ -24,6 +24,13 @@ SIZES = [(160, 64), (161, 83), (299, 20), (70, 131), (5, 700), (2100, 1), (1, 21
 @pytest.fixture(autouse=True)
 def thin_strips(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vdm, "STRIP", 1024)
+    monkeypatch.setattr(vdm, "BAND_STRIP", 512)
+    monkeypatch.setattr(bands, "LARGEST_AT_ONCE", 500)
+
+
+def whole_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    for place, name in ((vdm, "STRIP"), (vdm, "BAND_STRIP"), (bands, "LARGEST_AT_ONCE")):
+        monkeypatch.setattr(place, name, 2**40)
 
 
 def images(size: tuple[int, int], batch: int = 1) -> tuple[Tensor, Tensor]:
@@ -45,7 +52,7 @@ def test_strips_give_the_map_of_the_whole(
     metric = VDM(observer=observer, transform=transform)
     test, reference = images(size, batch=2)
     in_strips = metric(test, reference)
-    monkeypatch.setattr(vdm, "STRIP", 2**40)
+    whole_images(monkeypatch)
     torch.testing.assert_close(in_strips, metric(test, reference), rtol=1e-12, atol=1e-12)
 
 
@@ -62,7 +69,7 @@ def test_gradients_are_those_of_the_whole_image(monkeypatch: pytest.MonkeyPatch)
     test, reference = images((160, 64))
     test.requires_grad_()
     (gradient,) = torch.autograd.grad(metric.power(test, reference).sum(), test)
-    monkeypatch.setattr(vdm, "STRIP", 2**40)
+    whole_images(monkeypatch)
     (whole,) = torch.autograd.grad(metric.power(test, reference).sum(), test)
     assert torch.equal(gradient, whole)
     assert torch.count_nonzero(gradient) > 0
@@ -76,7 +83,7 @@ def test_gradients_of_checkpoints_in_strips_are_those_of_the_whole_image(
     test.requires_grad_()
     loss = VDMLoss(checkpoint=True)
     (gradient,) = torch.autograd.grad(loss(test, reference), test)
-    monkeypatch.setattr(vdm, "STRIP", 2**40)
+    whole_images(monkeypatch)
     (whole,) = torch.autograd.grad(loss(test, reference), test)
     torch.testing.assert_close(gradient, whole, rtol=1e-9, atol=1e-12)
     assert torch.count_nonzero(gradient) > 0

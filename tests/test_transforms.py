@@ -92,6 +92,8 @@ def test_is_the_reference(transform: Transform, kind: str, size: tuple[int, int]
             at = levels - 1 - level
             ours = actual.details[at][0, cone].numpy()
             np.testing.assert_allclose(ours, details, rtol=1e-9, atol=atol)
+            if not actual.lowpass:  # of overlapping nodes on a filtered image, which need none
+                continue
             ours = actual.lowpass[at][0, cone].numpy()
             np.testing.assert_allclose(ours, lowpass, rtol=1e-9, atol=atol)
 
@@ -157,10 +159,13 @@ def test_the_filter_is_the_reference(
 def test_bands_add_up_to_the_image() -> None:
     # The pyramid telescopes; what is left is one number, its coarsest lowpass.
     image = random_images(4, 2, 21, 40).double()
-    parted = bands.parted(image)
-    assert len(parted.planes) == 6
-    left = image - bands.gathered([torch.stack(planes).sum(0) for planes in parted.planes])
-    torch.testing.assert_close(left, parted.next[-1].expand_as(left))
+    assert bands.scales((21, 40)) == 6
+    planes, here = [], image
+    for scale in range(6):
+        some, _, here = bands.parted(here, scale == 0)
+        planes.append(torch.stack(some).sum(0))
+    left = image - bands.gathered(planes)
+    torch.testing.assert_close(left, here.expand_as(left))
 
 
 @pytest.mark.parametrize("frequency", bands.frequencies()[:5])

@@ -1,5 +1,7 @@
 """A 3x3 matrix applied to the channel axis: Eq. 1, Eq. 3 and the display's primaries."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -23,14 +25,17 @@ def mix(matrix: Tensor, planes: Tensor) -> Tensor:
     Tensor
         (B, N, ...).
     """
-    first, *others = planes.unbind(1)
-    rows = []
-    for row in matrix:
-        mixed = first * row[0]
-        for number, plane in enumerate(others, 1):
-            mixed = torch.addcmul(mixed, plane, row[number])
-        rows.append(mixed)
-    return torch.stack(rows, 1)
+    channels = planes.unbind(1)
+    return torch.stack([mix_row(row, channels) for row in matrix], 1)
+
+
+def mix_row(row: Tensor, channels: Sequence[Tensor]) -> Tensor:
+    """Return one output channel (B, ...) of `mix`, from the input channels one by one."""
+    first, *others = channels
+    mixed = first * row[0]
+    for number, plane in enumerate(others, 1):
+        mixed = torch.addcmul(mixed, plane, row[number])
+    return mixed
 
 
 def product(first: Tensor, second: Tensor) -> Tensor:

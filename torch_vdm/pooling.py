@@ -37,11 +37,11 @@ def surround_halves(energy: Tensor, nodes: int) -> Tensor:
 
 
 def pool_halves(surrounded: Tensor, nodes: int, dim: int) -> Tensor:
-    """Return along ``dim``, for every half of a node, the mean over those who cover it.
+    """Return along ``dim``, for every half of a node, the sum over those who cover it.
 
     The halves of a node are covered by two overlapping nodes, ``nodes`` times as many with the
     nodes beside these: 3 of them is the 3x3 pooling of `pool` at each shift, and the mean of the
-    shifts.
+    shifts, once the sum along both sides is divided by `covering`.
     """
     length = surrounded.shape[dim] - 1
     total = surrounded.narrow(dim, 0, length) + surrounded.narrow(dim, 1, length)
@@ -49,7 +49,12 @@ def pool_halves(surrounded: Tensor, nodes: int, dim: int) -> Tensor:
     total = pairs[0]
     for pair in pairs[1:]:
         total = total + pair
-    return total / (2.0 * nodes)
+    return total
+
+
+def covering(nodes: int) -> float:
+    """Return how many nodes `pool_halves` adds up for the half of a node, in x and in y."""
+    return float((2 * nodes) ** 2)
 
 
 def glance(nodes: Tensor, window: int, shifts: int) -> Tensor:

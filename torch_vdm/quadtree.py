@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torch_vdm.interleave import interleaved
+
 # Planes with no more numbers are enlarged by torch's own operation, which is faster for them.
 # Status: choice, measured.
 SMALL = 2**15
@@ -91,7 +93,7 @@ def push(nodes: Tensor, size: tuple[int, int]) -> Tensor:
         children = functional.interpolate(nodes, scale_factor=twice)
     else:
         # Columns, then rows: faster than repeating elements along one side and the other.
-        rows = torch.stack((nodes, nodes), -1).flatten(-2).unsqueeze(-2)
+        rows = interleaved(nodes, nodes, -1).unsqueeze(-2)
         children = rows.expand(*rows.shape[:-2], 2, rows.shape[-1]).flatten(-3, -2)
     if (children.shape[-2], children.shape[-1]) == size:
         return children  # no view, on which compiled code would be specialised

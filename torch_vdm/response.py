@@ -138,15 +138,16 @@ def response_difference(
     signed: bool,
     masking: bool,
     phases: int,
+    absolute: bool,
 ) -> Tensor:
-    """Return the difference of two images' responses at a level, absolute where they are signed.
+    """Return the difference of two images' responses at a level, if wanted ``absolute``.
 
     Each image by itself: equal images then take equal paths through the vectorised loops, and
     their difference is exactly 0.
     """
     options = matrix, exponent, signed, masking, phases
     difference = response(details, sight, *options) - response(other_details, other_sight, *options)
-    return difference.abs() if signed else difference
+    return difference.abs() if absolute else difference
 
 
 def response_difference_at(
@@ -154,8 +155,8 @@ def response_difference_at(
 ) -> Tensor:
     """Return `response_difference` where the parents are given for every node.
 
-    ``around`` is what `sights_of` takes, ``options`` what `response` takes beside details and
-    sight.
+    ``around`` is what `sights_of` takes, ``options`` what `response_difference` takes beside
+    details and sights.
     """
     first, second = sights_of(*around)
     return response_difference(details, other_details, first, second, *options)

@@ -31,10 +31,18 @@ from torch_vdm.distance import (
 from torch_vdm.effects import Effects
 from torch_vdm.fast import SMALLEST, compiled, step
 from torch_vdm.gradient import by_hand, local_difference
-from torch_vdm.matrix import product
+from torch_vdm.matrix import mix_row, product
 from torch_vdm.observer import Observer
 from torch_vdm.pair import Nonfinite
-from torch_vdm.pooling import glance, phase_energy, pool, pool_halves, surround, surround_halves
+from torch_vdm.pooling import (
+    covering,
+    glance,
+    phase_energy,
+    pool,
+    pool_halves,
+    surround,
+    surround_halves,
+)
 from torch_vdm.quadtree import push
 from torch_vdm.response import (
     OF_LUMINANCE,
@@ -58,6 +66,9 @@ LARGEST_AT_ONCE = 2**18
 # Pixels of a strip of a large image, and how many levels, from the finest, are computed in strips.
 # Status: choice, measured.
 STRIP, STRIP_LEVELS = 2**19, 2
+
+# Pixels of a strip in which a large image is filtered. Status: choice, measured.
+BAND_STRIP = 2**17
 
 # Levels of at most as many nodes are computed at once: there an operation costs more than the
 # numbers that it works on. Status: choice, measured.
@@ -270,7 +281,7 @@ class VDM(TiledMetric):
 
         One (B, 1, h, w) a level, level 0 first, and (B, 1, 1, 1).
         """
-        dtype = first.lowpass[0].dtype
+        dtype = first.mean.dtype
         constants = self._constants(dtype, "score_exponent", "score_coefficients")
         exponent = constants["score_exponent"]
         most = torch.finfo(dtype).max ** LARGEST_SCORED
@@ -291,7 +302,7 @@ class VDM(TiledMetric):
         if shifts == 1 and phases == 1:
             return (difference.abs() ** exponent).sum((1, 2)).unsqueeze(1)
         surrounded = surround_halves(phase_energy(difference, phases), 1)
-        energy = pool_halves(pool_halves(surrounded, 1, -1), 1, -2)
+        energy = pool_halves(pool_halves(surrounded, 1, -1), 1, -2) / covering(1)
         # As many coefficients as nodes side by side would have, and for one phase of a grating
         # its mean power over all: that of abs(cos)^exponent over that of its mean square.
         half = 0.5 * exponent
@@ -340,33 +351,64 @@ class VDM(TiledMetric):
         constants = self._constants(planes.dtype)
         passed = self._passed(constants["band_frequencies"], constants)
         weights, local = self._band_weights(constants)
-        parted = bands.parted(planes, self._fast)
-        seen = []
-        first = 0
-        for scale, around, lowpass in zip(*parted, strict=True):
-            some = slice(first, first + len(scale))
-            first = some.stop
-            at_places = None
-            if local is not None:
-                weigh = step(_band_sensitivity, lowpass, self._fast)
-                rows = torch.cat((local[some], local[-1:]))
-                weights_there = weigh(lowpass, rows, constants)
-                at_places = bands.expanded(weights_there, _size(around), self._fast)
-            contrast = step(_band_contrast, lowpass, self._fast)
-            seen.append(
-                contrast(
-                    scale,
-                    around,
-                    passed[some].clone(),
-                    weights[:, some].clone(),
-                    at_places,
-                    constants["dark_cones"],
-                    constants["opponents"],
-                )
-            )
+        seen: list[Tensor] = []
+        here = planes
+        for scale in range(bands.scales(_size(planes))):
+            finest = scale == 0
+            some = slice(0, 2) if finest else slice(scale + 1, scale + 2)
+            table = None if local is None else torch.cat((local[some], local[-1:]))
+            weighing = passed[some].clone(), weights[:, some].clone(), table
+            contrast, here = self._contrast_at_scale(here, finest, weighing, constants)
+            seen.append(contrast)
         if not seen:  # one pixel
             return 0.0 * planes[:, : len(constants["opponents"])]
         return bands.gathered(seen, self._fast)
+
+    def _contrast_at_scale(
+        self,
+        plane: Tensor,
+        finest: bool,
+        weighing: tuple[Tensor, Tensor, Tensor | None],
+        constants: dict[str, Tensor],
+    ) -> tuple[Tensor, Tensor]:
+        """Return the weighted contrast of a scale's bands, and the lowpass that it leaves.
+
+        ``weighing``: what chromatic aberration leaves, weights, and the table of those that follow
+        the luminance, all of these bands.
+        """
+        few = math.prod(_size(plane)) < 2 * BAND_STRIP
+        if few or self._fast or torch.compiler.is_compiling():
+            contrast, lowpass = self._kept(
+                self._contrast_of_part, plane, finest, weighing, constants
+            )
+            return contrast, lowpass
+        # Of large planes strip by strip, which stay in the processor's cache.
+        tiling = Tiling.strips(_size(plane), BAND_STRIP, 0, 1, bands.REACH)
+        pieces = []
+        for strip, around in zip(tiling, tiling.split_rows(plane), strict=True):
+            found = self._kept(self._contrast_of_part, around, finest, weighing, constants)
+            pieces.append([cut(part, strip.within(n)) for n, part in enumerate(found, 1)])
+        contrast, lowpass = (torch.cat(parts, -2) for parts in zip(*pieces, strict=True))
+        return contrast, lowpass
+
+    def _contrast_of_part(
+        self,
+        plane: Tensor,
+        finest: bool,
+        weighing: tuple[Tensor, Tensor, Tensor | None],
+        constants: dict[str, Tensor],
+    ) -> tuple[Tensor, Tensor]:
+        """Return the same of a plane as a whole."""
+        planes, around, lowpass = bands.parted(plane, finest, self._fast)
+        *weights, table = weighing
+        at_places = None
+        if table is not None:
+            weigh = step(_band_sensitivity, lowpass, self._fast)
+            at_places = weigh(lowpass, table, constants)
+            at_places = bands.expanded(at_places, _size(around), self._fast)
+        eye = constants["dark_cones"], constants["opponents"]
+        seen = step(_band_contrast, lowpass, self._fast)
+        return seen(planes, around, *weights, at_places, *eye), lowpass
 
     def _band_weights(self, constants: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
         """Return what weights bands so that the contrast sensitivity passes at their frequencies.
@@ -400,12 +442,11 @@ class VDM(TiledMetric):
 
         One (B, channels, orientations, h, w) a level, level 0 first; 1 is threshold.
         """
-        constants = self._constants(cortex.lowpass[0].dtype)
+        constants = self._constants(cortex.mean.dtype)
         responses = []
         levels = self._levels(cortex.finest, len(cortex.details), constants)
         for number, detail in enumerate(cortex.details):
-            level, parent = levels.only(number), cortex.parent_lowpass(number)
-            (sight,) = self._sights(level, constants, [parent])
+            (sight,) = self._sights(levels.only(number), constants, [cortex], number)
             responses.append(
                 response(detail, sight.pushed(_size(detail)), *self._options(constants))
             )
@@ -435,7 +476,7 @@ class VDM(TiledMetric):
 
     def _differences(self, first: Cortex, second: Cortex) -> tuple[tuple[Tensor, ...], Tensor]:
         """Return what each node adds to the map, and what every path begins with."""
-        constants = self._constants(first.lowpass[0].dtype, "summation_exponent")
+        constants = self._constants(first.mean.dtype, "summation_exponent")
         root = self.lowpass_difference(first, second) ** constants["summation_exponent"]
         return self.local_differences(first, second), root.sum(1, keepdim=True)
 
@@ -444,7 +485,7 @@ class VDM(TiledMetric):
 
         One (B, 1, h, w) a level, level 0 first.
         """
-        constants = self._constants(first.lowpass[0].dtype)
+        constants = self._constants(first.mean.dtype)
         levels = self._levels(first.finest, len(first.details), constants)
         few = sum(math.prod(_size(detail)) <= FEW_NODES for detail in first.details)
         return (
@@ -463,24 +504,24 @@ class VDM(TiledMetric):
             return []
         sizes = [_size(detail) for detail in first.details[:few]]
         nodes = [math.prod(size) for size in sizes]
-        details = [_in_a_row(cortex.details[:few]) for cortex in (first, second)]
-        # Both images in one batch, where nothing is computed.
-        parents = _in_a_row(
-            push(torch.cat([cortex.parent_lowpass(number) for cortex in (first, second)]), size)
-            for number, size in enumerate(sizes)
-        )
+        details = _in_a_row(first.details[:few]), _in_a_row(second.details[:few])
         fast = self._fast and details[0].numel() >= SMALLEST
-        both = [parent.clone() for parent in parents.chunk(2)]
         level, options = levels.in_a_row(nodes), self._options(constants)
         if self.transform.csf == "filter":
-            first_sight, second_sight = self._sights(level, constants, both)
+            sight = _weights_alone(level)
             difference = response_difference(
-                details[0], details[1], first_sight, second_sight, *options
+                details[0], details[1], sight, sight, *options, self._absolute
             )
         else:
+            # Both images in one batch, where nothing is computed.
+            parents = _in_a_row(
+                push(torch.cat([cortex.parent_lowpass(number) for cortex in (first, second)]), size)
+                for number, size in enumerate(sizes)
+            )
+            both = [parent.clone() for parent in parents.chunk(2)]
             respond = compiled(response_difference_at) if fast else response_difference_at
             seen_at = (both, level, *self._sight_options(constants))
-            difference = respond(details[0], details[1], seen_at, options)
+            difference = respond(*details, seen_at, (*options, self._absolute))
         around = [self._surrounded(plane) for plane in _planes(difference, sizes)]
         # Beside one another along the longer side, where the least is left to fill up.
         along = -1 if sizes[-1][0] <= sizes[-1][1] else -2
@@ -503,10 +544,10 @@ class VDM(TiledMetric):
     ) -> Tensor:
         """Return the local visual difference (B, 1, h, w) of one level."""
         details, others = first.details[number], second.details[number]
-        parents = [cortex.parent_lowpass(number) for cortex in (first, second)]
         fast = self._fast and details.numel() >= SMALLEST
         sight, other_sight = (
-            sight.pushed(_size(details)) for sight in self._sights(level, constants, parents, fast)
+            sight.pushed(_size(details))
+            for sight in self._sights(level, constants, (first, second), number, fast)
         )
         orientations = details.shape[2]
         respond = compiled(response_difference) if fast else response_difference
@@ -519,7 +560,7 @@ class VDM(TiledMetric):
         exponent, options = constants["summation_exponent"], self._options(constants)
 
         def gathered(one: Tensor, other: Tensor, sight: Sight, other_sight: Sight) -> Tensor:
-            difference = respond(one, other, sight, other_sight, *options)
+            difference = respond(one, other, sight, other_sight, *options, self._absolute)
             return self._gathered(difference, exponent, fast)
 
         # Where the gradient is known by hand, nothing needs to be kept.
@@ -560,6 +601,11 @@ class VDM(TiledMetric):
             self.transform.phases,
         )
 
+    @property
+    def _absolute(self) -> bool:
+        """Whether responses that may cancel are pooled as they are, and not as energies."""
+        return self.observer.signed and self.transform.shifts == 1
+
     def _gathered(self, difference: Tensor, exponent: Tensor, fast: bool = False) -> Tensor:
         """Return the local visual difference of response differences, after spatial pooling."""
         gather = compiled(_pooled_difference) if fast else _pooled_difference
@@ -585,12 +631,14 @@ class VDM(TiledMetric):
         self,
         level: Level,
         constants: dict[str, Tensor],
-        parents: Sequence[Tensor],
+        images: Sequence[Cortex],
+        number: int,
         fast: bool = False,
     ) -> list[Sight]:
-        """Return the sight of a level for each image, at the parents, whose lowpass is given."""
+        """Return the sight of a level, the one of this number, for each image, at its parents."""
         if self.transform.csf == "filter":
-            return [Sight(None, (1.0 / level.gain)[None, None])] * len(parents)
+            return [_weights_alone(level)] * len(images)
+        parents = [cortex.parent_lowpass(number) for cortex in images]
         look = compiled(sights_of) if fast else sights_of
         sights: list[Sight] = look(parents, level, *self._sight_options(constants))
         return sights
@@ -640,6 +688,11 @@ class VDM(TiledMetric):
 
 def _size(plane: Tensor) -> tuple[int, int]:
     return plane.shape[-2], plane.shape[-1]
+
+
+def _weights_alone(level: Level) -> Sight:
+    """Return the sight of a level of filtered images: of details that are contrasts already."""
+    return Sight(None, (1.0 / level.gain)[None, None])
 
 
 def _in_a_row(planes: Iterable[Tensor]) -> Tensor:
@@ -701,26 +754,17 @@ def _band_contrast(
     those of A, and of C1 and C2, where they are local.
     """
     adaptation = 1.0 / adapted(around, dark_cones)
-    achromatic: list[Tensor] = []
-    chromatic: list[Tensor] = []
+    seen: list[Tensor] = []
     for number, band in enumerate(scale):
-        contrast = local_contrast(band.unsqueeze(2), adaptation).squeeze(2)
+        contrast = local_contrast(band.unsqueeze(2), adaptation).squeeze(2).unbind(1)
         mixing = matrix * passed[number] * weights[:, number, None]
-        # A by itself, for its weights follow the luminance band by band.
-        seen = opponents(contrast, mixing[:1])
-        achromatic.append(seen if at_places is None else seen * at_places[:, number, None])
-        if len(matrix) > 1:
-            chromatic.append(opponents(contrast, mixing[1:]))
-    if not chromatic:
-        return _added(achromatic)
-    colours = _added(chromatic)
-    colours = colours if at_places is None else colours * at_places[:, -1:]
-    return torch.cat((_added(achromatic), colours), 1)
-
-
-def _added(planes: list[Tensor]) -> Tensor:
-    """Return the sum of one plane or two."""
-    return planes[0] if len(planes) == 1 else planes[0] + planes[1]
+        channels = [mix_row(row, contrast) for row in mixing]
+        if at_places is not None:  # A's by themselves, for they follow the luminance band by band
+            channels[0] = channels[0] * at_places[:, number]
+        seen = [a + b for a, b in zip(seen, channels, strict=True)] if seen else channels
+    if at_places is not None:
+        seen[1:] = [colour * at_places[:, -1] for colour in seen[1:]]
+    return torch.stack(seen, 1)
 
 
 def _pooled_difference(
@@ -733,5 +777,6 @@ def _pooled_difference(
     those of overlapping nodes as energies that are pooled along rows.
     """
     if overlapping:
-        return local_visual_difference_of_energy(pool_halves(surrounded, nodes, -2), exponent)
+        energy = pool_halves(surrounded, nodes, -2) / covering(nodes)
+        return local_visual_difference_of_energy(energy, exponent)
     return local_visual_difference(pool(surrounded) if nodes > 1 else surrounded, exponent)

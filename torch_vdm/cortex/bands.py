@@ -18,6 +18,7 @@ from torch.nn import functional
 from torch_vdm.cortex.gaussian import along, response
 from torch_vdm.cortex.transform import DEEPEST
 from torch_vdm.fast import step
+from torch_vdm.interleave import interleaved
 
 # Weights of the lowpass that parts the finest octave: half is left at a quarter of a cycle a pixel.
 # Status: choice.
@@ -31,53 +32,72 @@ LOWPASS = (1 / 64, 6 / 64, 15 / 64, 20 / 64, 15 / 64, 6 / 64, 1 / 64)
 # one at half of it. About what these bands have most of. Status: choice.
 SECOND, NEXT = 0.1764, 0.0775
 
+# Planes with more numbers are gathered in parts, which stay in the processor's cache.
+# Status: choice, measured.
+LARGEST_AT_ONCE = 2**18
+
 # Bands that constants are made for.
 MOST = DEEPEST + 1
 
 
-class Bands(NamedTuple):
-    """The bands of a batch of planes, the finest first.
+# How far, in samples of a plane, that lies which a place of its `Scale` is made of. Printed by the
+# weights above.
+REACH = 10
+
+
+class Scale(NamedTuple):
+    """The bands of a batch of planes that are of these planes' own density.
 
     Attributes
     ----------
-    planes
-        The bands of every scale, (B, C, h, w): one, but two of the first. The first is of the
-        image's size, each next one of half its sides, rounded up. None for an image of one pixel.
+    bands
+        (B, C, h, w) each, the finest first: one, but two of an image.
     around
-        One (B, C, h, w) a scale: the lowpass at the same places, without all bands so far.
-    next
-        The same, (B, C, ceil(h / 2), ceil(w / 2)), before it is brought to these places.
+        (B, C, h, w): the lowpass at the same places, without these bands and all finer ones.
+    lowpass
+        The same, (B, C, ceil(h / 2), ceil(w / 2)), before it is brought to these places: what the
+        next scale is parted from.
     """
 
-    planes: tuple[tuple[Tensor, ...], ...]
-    around: tuple[Tensor, ...]
-    next: tuple[Tensor, ...]
+    bands: tuple[Tensor, ...]
+    around: Tensor
+    lowpass: Tensor
 
 
-def parted(image: Tensor, fast: bool = False) -> Bands:
-    """Part (B, C, H, W) into bands, by compiled steps if ``fast``."""
-    planes: list[tuple[Tensor, ...]] = []
-    around: list[Tensor] = []
-    lowpass: list[Tensor] = []
-    here = image
-    for _ in range((max(image.shape[-2:]) - 1).bit_length()):
-        finer = here
-        if not planes:
-            rows = step(_parted_rows, image, fast)(image)
-            here = step(_parted_columns, image, fast)(rows)
-        lowpass.append(reduced(here, fast))
-        around.append(expanded(lowpass[-1], (here.shape[-2], here.shape[-1]), fast))
-        band = here - around[-1]
-        planes.append((band,) if planes else (finer - here, band))
-        here = lowpass[-1]
-    return Bands(tuple(planes), tuple(around), tuple(lowpass))
+def scales(size: tuple[int, int]) -> int:
+    """Return the number of scales of an image of ``size`` = (H, W): 0 for one pixel."""
+    return (max(size) - 1).bit_length()
+
+
+def parted(plane: Tensor, finest: bool, fast: bool = False) -> Scale:
+    """Part a scale's bands from (B, C, h, w), the image if ``finest``, by compiled steps."""
+    here = plane
+    if finest:
+        rows = step(_parted_rows, plane, fast)(plane)
+        here = step(_parted_columns, plane, fast)(rows)
+    lowpass = reduced(here, fast)
+    around = expanded(lowpass, (here.shape[-2], here.shape[-1]), fast)
+    band = here - around
+    return Scale((plane - here, band) if finest else (band,), around, lowpass)
 
 
 def gathered(planes: Sequence[Tensor], fast: bool = False) -> Tensor:
     """Add up one plane (B, C, h, w) a scale, the finest first, to one of the finest size."""
     total = planes[-1]
     for plane in reversed(planes[:-1]):
-        total = plane + expanded(total, (plane.shape[-2], plane.shape[-1]), fast)
+        if fast or plane.numel() <= LARGEST_AT_ONCE:
+            total = plane + expanded(total, (plane.shape[-2], plane.shape[-1]), fast)
+            continue
+        rows = max(1, LARGEST_AT_ONCE * plane.shape[-2] // plane.numel())
+        parts = plane.split(rows, -2)
+        columns = _expanded_columns(total, plane.shape[-2]).split(rows, -2)
+        total = torch.cat(
+            [
+                part.add(_expanded_rows(column, plane.shape[-1]))
+                for part, column in zip(parts, columns, strict=True)
+            ],
+            -2,
+        )
     return total
 
 
@@ -122,21 +142,21 @@ def _reduced_columns(plane: Tensor) -> Tensor:
 
 
 def _expanded_rows(plane: Tensor, width: int) -> Tensor:
-    return _expanded(plane, -1).flatten(-2)[..., :width]
+    return _expanded(plane, -1)[..., :width]
 
 
 def _expanded_columns(plane: Tensor, height: int) -> Tensor:
-    return _expanded(plane, -2).flatten(-3, -2)[..., :height, :]
+    return _expanded(plane, -2)[..., :height, :]
 
 
 def _expanded(plane: Tensor, dim: int) -> Tensor:
-    """Return what lies at the samples of a plane and after each, stacked at ``dim``."""
+    """Return what lies at the samples of a plane and after each, in turn along ``dim``."""
     length = plane.shape[dim]
     padded = surrounded(plane, 2, dim)
     before, here, after, far = (padded.narrow(dim, tap, length) for tap in (1, 2, 3, 4))
-    even = (2.0 * LOWPASS[3]) * here + (2.0 * LOWPASS[1]) * (before + after)
-    odd = (2.0 * LOWPASS[2]) * (here + after) + (2.0 * LOWPASS[0]) * (before + far)
-    return torch.stack((even, odd), dim)
+    even = ((2.0 * LOWPASS[3]) * here).add_(before + after, alpha=2.0 * LOWPASS[1])
+    odd = (here + after).mul_(2.0 * LOWPASS[2]).add_(before + far, alpha=2.0 * LOWPASS[0])
+    return interleaved(even, odd, dim)
 
 
 def share(band: int, frequency: float) -> float:

@@ -9,11 +9,11 @@ would filter the rows anew for each tap of a column.
 import math
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 from torch.nn import functional
 
 from torch_vdm.fast import step
+from torch_vdm.interleave import interleaved
 
 # Weights of the lowpass, of sum 1; a = 3/8. Status: source.
 CENTRE, NEXT, OUTER = 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0
@@ -105,11 +105,11 @@ def _expanded_rows(plane: Tensor, width: int) -> Tensor:
     padded = functional.pad(plane, (1, 1, 0, 0), mode="replicate")
     left, here, right = padded[..., :-2], padded[..., 1:-1], padded[..., 2:]
     even = 2.0 * CENTRE * here + 2.0 * OUTER * (left + right)
-    return torch.stack((even, 2.0 * NEXT * (here + right)), -1).flatten(-2)[..., :width]
+    return interleaved(even, 2.0 * NEXT * (here + right), -1)[..., :width]
 
 
 def _expanded_columns(plane: Tensor, height: int) -> Tensor:
     padded = functional.pad(plane, (0, 0, 1, 1), mode="replicate")
     up, here, down = padded[..., :-2, :], padded[..., 1:-1, :], padded[..., 2:, :]
     even = 2.0 * CENTRE * here + 2.0 * OUTER * (up + down)
-    return torch.stack((even, 2.0 * NEXT * (here + down)), -2).flatten(-3, -2)[..., :height, :]
+    return interleaved(even, 2.0 * NEXT * (here + down), -2)[..., :height, :]

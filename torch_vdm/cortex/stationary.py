@@ -18,6 +18,7 @@ from torch_vdm.cortex.haar import (
 )
 from torch_vdm.cortex.transform import CSF, Base, Cortex, checked_csf, mean_of
 from torch_vdm.fast import step
+from torch_vdm.interleave import interleaved
 from torch_vdm.quadtree import share
 
 
@@ -72,7 +73,7 @@ class StationaryHaar:
         parts = [planes, planes, *means][: len(details)]
         if not parts:
             return Cortex((), (planes,), mean)
-        return _cortex(parts, 0, size, mean, fast, true_means)
+        return self._cortex(parts, 0, size, mean, fast, true_means)
 
     def begin(
         self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
@@ -81,7 +82,8 @@ class StationaryHaar:
         size = (planes.shape[-2], planes.shape[-1])
         _, means = levels(planes, 1, size, fast, true_means, count - 2)
         parts = [planes, planes, *means]
-        return _cortex(parts, 0, size, planes[..., :1, :1], fast, true_means), means[-1]
+        none = planes[..., :1, :1]
+        return self._cortex(parts, 0, size, none, fast, true_means), means[-1]
 
     def rest(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
         """Return the coarser levels; see `Transform.rest`."""
@@ -97,7 +99,7 @@ class StationaryHaar:
         """Decompose the rest of an image; see `Transform.resume`."""
         details, means = levels(base.plane, 2**base.octaves, base.size, fast, true_means)
         parts = [base.plane, *means][: len(details) - 1]
-        return _cortex(parts, base.octaves + 1, base.size, base.mean, fast, true_means)
+        return self._cortex(parts, base.octaves + 1, base.size, base.mean, fast, true_means)
 
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
         """Return the best frequency, cycles/pixel, and its gain for d1, d2 and d3.
@@ -108,25 +110,27 @@ class StationaryHaar:
             return Haar("filter").peaks(level_from_finest)
         return _peaks(level_from_finest)
 
-
-def _cortex(
-    parts: list[Tensor],
-    finest: int,
-    size: tuple[int, int],
-    mean: Tensor,
-    fast: bool,
-    true_means: bool,
-) -> Cortex:
-    """Return the levels from ``finest`` on, of the means that are the parts of their nodes."""
-    details: list[Tensor] = []
-    lowpass: list[Tensor] = []
-    for level, part in enumerate(parts, finest):
-        faded = _faded(part, size, 2 ** max(level - 1, 0)) if true_means else part
-        analyse = _halves if level == 0 else _quarters
-        lowest, detail = step(analyse, part, fast)(faded)
-        details.append(detail)
-        lowpass.append(lowest)
-    return Cortex(tuple(reversed(details)), tuple(reversed(lowpass)), mean, finest)
+    def _cortex(
+        self,
+        parts: list[Tensor],
+        finest: int,
+        size: tuple[int, int],
+        mean: Tensor,
+        fast: bool,
+        true_means: bool,
+    ) -> Cortex:
+        """Return the levels from ``finest`` on, of the means that are the parts of their nodes."""
+        details: list[Tensor] = []
+        lowpass: list[Tensor] = []
+        # Of what the image is adapted to, nothing is asked after its filter.
+        means = self.csf == "levels"
+        for level, part in enumerate(parts, finest):
+            faded = _faded(part, size, 2 ** max(level - 1, 0)) if true_means else part
+            analyse = _halves if level == 0 else _quarters
+            detail, *lowest = step(analyse, part, fast)(faded, means)
+            details.append(detail)
+            lowpass += lowest
+        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass)), mean, finest)
 
 
 def _faded(parts: Tensor, size: tuple[int, int], node: int) -> Tensor:
@@ -146,8 +150,11 @@ def _faded(parts: Tensor, size: tuple[int, int], node: int) -> Tensor:
     return parts
 
 
-def _combined(corner: Callable[[int, int], Tensor], apart: int) -> tuple[Tensor, Tensor]:
-    """Return lowpass and details, Eq. 2, of the four quarters of nodes."""
+def _combined(corner: Callable[[int, int], Tensor], apart: int, means: bool) -> list[Tensor]:
+    """Return details and, with ``means``, lowpass, Eq. 2, of the four quarters of nodes.
+
+    ``corner`` gives a fourth of each quarter: so little is scaled.
+    """
     left, right = corner(0, 0), corner(0, apart)
     top_sum, top_difference = left + right, left - right
     left, right = corner(apart, 0), corner(apart, apart)
@@ -157,18 +164,18 @@ def _combined(corner: Callable[[int, int], Tensor], apart: int) -> tuple[Tensor,
         top_sum - bottom_sum,
         top_difference - bottom_difference,
     )
-    return 0.25 * (top_sum + bottom_sum), torch.stack(details, 2).mul_(0.25)
+    return [torch.stack(details, 2), *([top_sum + bottom_sum] if means else [])]
 
 
-def _halves(parts: Tensor) -> tuple[Tensor, Tensor]:
-    """Return lowpass and details of nodes of 2 x 2 parts that begin at every part."""
+def _halves(parts: Tensor, means: bool) -> list[Tensor]:
+    """Return what `_combined` does of nodes of 2 x 2 parts that begin at every part."""
     height, width = parts.shape[-2:]
-    padded = functional.pad(parts, (0, 1, 0, 1), mode="replicate")
-    return _combined(lambda y, x: padded[..., y : y + height, x : x + width], 1)
+    padded = functional.pad(0.25 * parts, (0, 1, 0, 1), mode="replicate")
+    return _combined(lambda y, x: padded[..., y : y + height, x : x + width], 1, means)
 
 
-def _quarters(parts: Tensor) -> tuple[Tensor, Tensor]:
-    """Return lowpass and details of nodes of 4 x 4 parts that begin at every second part or next.
+def _quarters(parts: Tensor, means: bool) -> list[Tensor]:
+    """Return the same of nodes of 4 x 4 parts that begin at every second part or next.
 
     In rows of two by two nodes: at (0, 0), (1, 3), (2, 1) and (3, 2), where half a node is 2.
     """
@@ -177,27 +184,22 @@ def _quarters(parts: Tensor) -> tuple[Tensor, Tensor]:
     more = 4 * columns + 3 - parts.shape[-1], 4 * rows + 3 - parts.shape[-2]
     padded = functional.pad(parts, (0, more[0], 0, more[1]), mode="replicate")
     halves = padded[..., :-1, :] + padded[..., 1:, :]
-    halves = 0.25 * (halves[..., :-1] + halves[..., 1:])
+    halves = (0.25 * 0.25) * (halves[..., :-1] + halves[..., 1:])
 
-    def nodes(top: int, left: int) -> tuple[Tensor, Tensor]:
+    def nodes(top: int, left: int) -> list[Tensor]:
         def corner(y: int, x: int) -> Tensor:
             y, x = top + y, left + x
             return halves[..., y : y + 4 * rows - 3 : 4, x : x + 4 * columns - 3 : 4]
 
-        return _combined(corner, 2)
+        return _combined(corner, 2, means)
 
     four = nodes(0, 0), nodes(1, 3), nodes(2, 1), nodes(3, 2)
-    lowpass, details = (
-        _interleaved(*planes)[..., :height, :width] for planes in zip(*four, strict=True)
-    )
-    return lowpass, details
+    return [_two_by_two(*planes)[..., :height, :width] for planes in zip(*four, strict=True)]
 
 
-def _interleaved(one: Tensor, right: Tensor, below: Tensor, across: Tensor) -> Tensor:
+def _two_by_two(one: Tensor, right: Tensor, below: Tensor, across: Tensor) -> Tensor:
     """Return (..., 2 h, 2 w) with each of four planes at one place of two by two."""
-    upper = torch.stack((one, right), -1).flatten(-2)
-    lower = torch.stack((below, across), -1).flatten(-2)
-    return torch.stack((upper, lower), -2).flatten(-3, -2)
+    return interleaved(interleaved(one, right, -1), interleaved(below, across, -1), -2)
 
 
 @lru_cache

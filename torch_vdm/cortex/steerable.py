@@ -13,6 +13,7 @@ from torch_vdm.cortex import oriented
 from torch_vdm.cortex.gaussian import blur, lowpass_response
 from torch_vdm.cortex.transform import CSF, DEEPEST, Base, Cortex, mean_of
 from torch_vdm.fast import SMALLEST, step
+from torch_vdm.interleave import interleaved
 
 # The image half-way between its pixels, which the finest level needs: a sinc of so many taps on
 # either side, under a Hann window. Status: choice.
@@ -160,7 +161,7 @@ def _doubled(plane: Tensor, dim: int) -> Tensor:
     for tap, weight in enumerate(WEIGHTS):
         pair = padded.narrow(dim, HALFWAY - 1 - tap, length)
         between = between + weight * (pair + padded.narrow(dim, HALFWAY + tap, length))
-    return torch.stack((plane, between), dim).flatten(dim - 1, dim)
+    return interleaved(plane, between, dim)
 
 
 def _dropped(plane: Tensor) -> Tensor:

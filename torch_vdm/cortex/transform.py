@@ -26,7 +26,8 @@ class Cortex(NamedTuple):
         One tensor a level, (B, cones, orientations, h, w): the detail coefficients.
     lowpass
         One tensor a level, (B, cones, h, w): the lowpass coefficients of the same nodes. An
-        image of one pixel has no details and one lowpass, itself.
+        image of one pixel has no details and one lowpass, itself. Of a filtered image, in which
+        nothing is adapted to them any more, a transform may leave them out.
     mean
         (B, cones, 1, 1), the mean of the image. Not the root's lowpass, in which the repeated
         border of an odd side may count for more than it is.
