@@ -12,10 +12,16 @@ from torch_vdm import VDM, Display, Effects, Haar, ImageError, Observer, Station
 from torch_vdm.cortex import Transform
 from torch_vdm.io import ArrayFile
 
-TRANSFORMS: list[Transform] = [Haar(), StationaryHaar(), Steerable()]
+TRANSFORMS: list[Transform] = [
+    Haar(),
+    StationaryHaar(),
+    Steerable(),
+    Haar("filter"),
+    StationaryHaar("filter"),
+]
 OBSERVERS = [Observer.calibrated(), Observer.paper()]
 NAMES = ("test", "reference")
-each_transform = pytest.mark.parametrize("transform", TRANSFORMS, ids=lambda t: type(t).__name__)
+each_transform = pytest.mark.parametrize("transform", TRANSFORMS, ids=repr)
 each_observer = pytest.mark.parametrize("observer", OBSERVERS, ids=lambda o: o.name)
 
 

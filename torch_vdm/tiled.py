@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_vdm.cortex import Cortex, Transform
+from torch_vdm.cortex import Cortex, Transform, bands
 from torch_vdm.cortex.transform import Base
 from torch_vdm.distance import accumulate, just_noticeable
 from torch_vdm.observer import Observer
@@ -18,6 +18,7 @@ from torch_vdm.tiling import (
     TILE,
     Slices,
     Source,
+    Tile,
     Tiling,
     check_sources,
     cut,
@@ -41,6 +42,15 @@ class _Done(NamedTuple):
     seen: Tensor | None
 
 
+class _Pair(NamedTuple):
+    """The same part of a test and a reference."""
+
+    planes: list[Tensor]
+    """The cone responses to each."""
+    seen: Tensor | None
+    """Where both are finite, if that is asked."""
+
+
 class TiledMetric(PairMetric):
     """A metric whose levels are computed in tiles or from the whole image's lowpass pyramid.
 
@@ -54,12 +64,21 @@ class TiledMetric(PairMetric):
     observer: Observer
     summation_exponent: Tensor
 
-    def represent(self, image: Tensor) -> Cortex:
-        """Return the cortex representation of an image."""
+    def _cone_planes(self, image: Tensor) -> Tensor:
+        """Return the cone responses to an image."""
         raise NotImplementedError
 
-    def _cone_planes(self, image: Tensor) -> Tensor:
-        """Return the cone responses to an image, which `represent` decomposes."""
+    def _decomposed(self, planes: Tensor, coarser: Tensor | None = None) -> Cortex:
+        """Return the cortex representation of cone planes; ``coarser`` as `_filtered`."""
+        raise NotImplementedError
+
+    def _filtered(self, planes: Tensor, coarser: Tensor | None = None, finest: int = 0) -> Tensor:
+        """Return what is decomposed of cone planes: these, or their weighted contrast.
+
+        Where ``planes`` are part of an image, the weighted contrast that is left without its finest
+        scales is given as ``coarser``, at the density that these reduce it to. ``finest``: of
+        planes that `bands.lowpass` has reduced by so many scales.
+        """
         raise NotImplementedError
 
     def _differences(self, first: Cortex, second: Cortex) -> tuple[Sequence[Tensor], Tensor]:
@@ -87,7 +106,8 @@ class TiledMetric(PairMetric):
 
         Levels up to the size of a tile are computed tile by tile, coarser ones once, from the
         lowpass pyramid of the whole images, which is read first: so the images are read twice, and
-        little more than the map and one tile is in memory. Without gradients.
+        little more than the map and one tile is in memory. Behind a filter they are read once more,
+        for what is coarser than a tile is filtered first. Without gradients.
 
         Parameters
         ----------
@@ -170,32 +190,38 @@ class TiledMetric(PairMetric):
         ``nodes``: how many nodes around a node ``paths`` takes in.
         """
         items, size = check_sources(test, reference)
-        if self.transform.csf != "levels":
-            raise ValueError(
-                'expected a transform with csf="levels" for tiles, got csf="filter", '
-                "which needs the image whole"
-            )
         shifts = self.transform.shifts
         tiling = Tiling.fit(size, side, shifts, self.transform.reach + nodes)
+        filtered = self.transform.csf == "filter" and not tiling.whole
+        if filtered:
+            tiling = tiling.wider(bands.halo(_scales(tiling)))
         device = self.summation_exponent.device
         steps = count(1)
-        all_steps = items * len(tiling) * (1 if tiling.whole else 2)
+        all_steps = items * len(tiling) * (1 if tiling.whole else 2 + filtered)
 
-        def images(item: int, part: Slices) -> tuple[Tensor, Tensor, Tensor | None]:
+        def images(item: int, part: Slices) -> _Pair:
             one, other = (read(source, item, part).to(device) for source in (test, reference))
-            return self._checked(one, other, (item, part[0].start, part[1].start))
+            one, other, seen = self._checked(one, other, (item, part[0].start, part[1].start))
+            return _Pair([self._cone_planes(one), self._cone_planes(other)], seen)
 
         def step() -> None:
             if progress is not None:
                 progress(next(steps), all_steps)
 
         for item in range(items):
+            read_part = partial(images, item)
+            contrasts: list[Tensor] | None = None
             coarse = None
+            if filtered:
+                contrasts = self._coarse_contrasts(read_part, tiling, step)
             if not tiling.whole:
-                coarse = accumulate(*paths(*self._coarse(partial(images, item), tiling, step)))
+                representations = self._coarse(read_part, tiling, contrasts, step)
+                coarse = accumulate(*paths(*representations))
             for tile in tiling:
-                one, other, seen = images(item, tile.around)
-                local, total = paths(self.represent(one), self.represent(other))
+                planes, seen = read_part(tile.around)
+                around = _around(tile, tiling, contrasts)
+                first, second = map(self._decomposed, planes, around)
+                local, total = paths(first, second)
                 if coarse is not None:
                     fine = enumerate(reversed(local[-tiling.levels :]))
                     local = [cut(plane, tile.within(2 ** (k + 1) // shifts)) for k, plane in fine]
@@ -205,10 +231,24 @@ class TiledMetric(PairMetric):
                 yield _Done(item, tile.part, accumulate(local, total), seen)
                 step()
 
+    def _coarse_contrasts(
+        self, images: Callable[[Slices], _Pair], tiling: Tiling, step: Callable[[], None]
+    ) -> list[Tensor]:
+        """Return the weighted contrast of both images without their `_scales`."""
+        scales = _scales(tiling)
+        planes: tuple[list[Tensor], list[Tensor]] = [], []
+        for tile in tiling:
+            for tiles, cones in zip(planes, images(tile.around).planes, strict=True):
+                left = bands.lowpass(cones, scales, self._fast)
+                tiles.append(cut(left, tile.within(2**scales)))
+            step()
+        return [self._filtered(tiling.joined(tiles), finest=scales) for tiles in planes]
+
     def _coarse(
         self,
-        images: Callable[[Slices], tuple[Tensor, Tensor, Tensor | None]],
+        images: Callable[[Slices], _Pair],
         tiling: Tiling,
+        contrasts: list[Tensor] | None,
         step: Callable[[], None],
     ) -> list[Cortex]:
         """Return the levels of both images that are coarser than those of tiles."""
@@ -218,10 +258,10 @@ class TiledMetric(PairMetric):
         planes: tuple[list[Tensor], list[Tensor]] = [], []
         sums = [torch.zeros(1, 1, 1, 1, dtype=torch.float64)] * 2
         for tile in tiling:
-            *pair, _ = images(tile.around)
-            for number, image in enumerate(pair):
-                cones = self._cone_planes(image)
-                reduced = self.transform.reduced(cones, octaves, *options)
+            around = _around(tile, tiling, contrasts)
+            for number, cones in enumerate(images(tile.around).planes):
+                source = self._filtered(cones, around[number])
+                reduced = self.transform.reduced(source, octaves, *options)
                 planes[number].append(cut(reduced, tile.within(2**octaves)))
                 inside = cut(cones, tile.within(1)).double().sum((-2, -1), keepdim=True)
                 sums[number] = sums[number].to(inside) + inside
@@ -229,14 +269,25 @@ class TiledMetric(PairMetric):
         pixels = math.prod(tiling.size)
         coarse = []
         for tiles, total in zip(planes, sums, strict=True):
-            rows = [
-                torch.cat(tiles[n : n + tiling.across], -1)
-                for n in range(0, len(tiles), tiling.across)
-            ]
-            plane = torch.cat(rows, -2)
+            plane = tiling.joined(tiles)
             base = Base(plane, octaves, tiling.size, (total / pixels).to(plane))
             coarse.append(self.transform.resume(base, *options))
         return coarse
+
+
+def _scales(tiling: Tiling) -> int:
+    """Return how many scales are filtered in tiles: fewer than levels, for they reach further."""
+    return max(tiling.levels - 2, 1)
+
+
+def _around(
+    tile: Tile, tiling: Tiling, contrasts: list[Tensor] | None
+) -> list[Tensor] | list[None]:
+    """Return what `_coarse_contrasts` gives around a tile, for each image."""
+    if contrasts is None:
+        return [None, None]
+    whole = Tile(tile.around, tile.around)
+    return [cut(contrast, whole.of_image(2 ** _scales(tiling))) for contrast in contrasts]
 
 
 def _size(part: Slices) -> tuple[int, int]:

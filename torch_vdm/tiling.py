@@ -1,7 +1,7 @@
 """Images larger than memory: where their tiles lie, and how a part of one is read."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple, Protocol
 
@@ -119,6 +119,17 @@ class Tiling:
         # No thinner than so many halos, which are computed twice.
         rows = max(pixels // (size[1] * parent) * parent, 4 * halo)
         return cls(size, (rows, size[1]), levels, halo)
+
+    def wider(self, pixels: int) -> "Tiling":
+        """Return the tiling with halos that are wider by so many pixels, or a few more."""
+        parent = 2 ** (self.levels + 1)
+        return replace(self, halo=self.halo + -(-pixels // parent) * parent)
+
+    def joined(self, parts: Sequence[Tensor]) -> Tensor:
+        """Return the plane of the image of one part (B, C, h, w) a tile, row by row."""
+        across = self.across
+        rows = [torch.cat(list(parts[n : n + across]), -1) for n in range(0, len(parts), across)]
+        return torch.cat(rows, -2)
 
     def split_rows(self, image: Tensor) -> Iterator[Tensor]:
         """Yield what each strip is computed with, of an image (B, C, H, W).

@@ -212,7 +212,7 @@ class VDM(TiledMetric):
         sources, means = [test, reference], None
         if filtered:  # which needs the image whole
             cones = [self._cone_planes(image) for image in sources]
-            sources = [self._weighted_contrast(planes) for planes in cones]
+            sources = [self._filtered(planes) for planes in cones]
             means = [mean_of(planes) for planes in cones]
 
         def strip_of(strip: Tile, one: Tensor, other: Tensor) -> list[Tensor]:
@@ -315,12 +315,17 @@ class VDM(TiledMetric):
 
         ``image`` is (B, 3, H, W) in float32 or float64, as the display expects it.
         """
-        planes = self._cone_planes(image)
+        return self._decomposed(self._cone_planes(image))
+
+    def _decomposed(self, planes: Tensor, coarser: Tensor | None = None) -> Cortex:
         options = self._fast, self.observer.true_means
+        seen = self.transform.decompose(self._filtered(planes, coarser), *options)
+        return seen if self.transform.csf == "levels" else seen._replace(mean=mean_of(planes))
+
+    def _filtered(self, planes: Tensor, coarser: Tensor | None = None, finest: int = 0) -> Tensor:
         if self.transform.csf == "levels":
-            return self.transform.decompose(planes, *options)
-        seen = self.transform.decompose(self._weighted_contrast(planes), *options)
-        return seen._replace(mean=mean_of(planes))
+            return planes
+        return self._weighted_contrast(planes, coarser, finest)
 
     def _cone_planes(self, image: Tensor) -> Tensor:
         """Return the cone responses (B, 3, H, W) to an image: display, cones."""
@@ -342,24 +347,30 @@ class VDM(TiledMetric):
         parts = zip(*(image.split(rows, -2) for image in images), strict=True)
         return torch.cat([self._kept(function, *part) for part in parts], -2)
 
-    def _weighted_contrast(self, planes: Tensor) -> Tensor:
+    def _weighted_contrast(
+        self, planes: Tensor, coarser: Tensor | None = None, finest: int = 0
+    ) -> Tensor:
         """Return the weighted contrast of A, C1, C2, 1 at threshold, of cone planes (B, 3, H, W).
 
         The stages from chromatic aberration to the contrast sensitivity on smooth bands, each in
-        its own lowpass and luminance, and all bands together again: (B, channels, H, W).
+        its own lowpass and luminance, and all bands together again: (B, channels, H, W). From the
+        scale ``finest`` on, to the coarsest or to that where ``coarser`` is the sum of the rest.
         """
         constants = self._constants(planes.dtype)
         passed = self._passed(constants["band_frequencies"], constants)
         weights, local = self._band_weights(constants)
         seen: list[Tensor] = []
-        here = planes
-        for scale in range(bands.scales(_size(planes))):
-            finest = scale == 0
-            some = slice(0, 2) if finest else slice(scale + 1, scale + 2)
+        here, last = planes, (1, 1) if coarser is None else _size(coarser)
+        for scale in itertools.count(finest):
+            if _size(here) == last:
+                break
+            some = slice(0, 2) if scale == 0 else slice(scale + 1, scale + 2)
             table = None if local is None else torch.cat((local[some], local[-1:]))
             weighing = passed[some].clone(), weights[:, some].clone(), table
-            contrast, here = self._contrast_at_scale(here, finest, weighing, constants)
+            contrast, here = self._contrast_at_scale(here, scale == 0, weighing, constants)
             seen.append(contrast)
+        if coarser is not None:
+            seen.append(coarser)
         if not seen:  # one pixel
             return 0.0 * planes[:, : len(constants["opponents"])]
         return bands.gathered(seen, self._fast)

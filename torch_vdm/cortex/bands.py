@@ -64,21 +64,40 @@ class Scale(NamedTuple):
     lowpass: Tensor
 
 
-def scales(size: tuple[int, int]) -> int:
-    """Return the number of scales of an image of ``size`` = (H, W): 0 for one pixel."""
-    return (max(size) - 1).bit_length()
+def halo(count: int) -> int:
+    """Return how many pixels around a part of an image `gathered` needs at most to be right there.
+
+    Where its ``count`` finest scales are parted from the part, and all others from the whole image.
+    """
+    # Behind the border of a part the lowpass of a scale is wrong over 5 samples at most.
+    wrong = 0
+    for _ in range(count):
+        wrong = max(REACH + 5, 2 * (wrong + 2))
+    return wrong
+
+
+def lowpass(image: Tensor, count: int, fast: bool = False) -> Tensor:
+    """Return what is left of (B, C, H, W) after its ``count`` finest scales."""
+    here = image
+    for scale in range(count):
+        here = reduced(_smooth(here, fast) if scale == 0 else here, fast)
+    return here
 
 
 def parted(plane: Tensor, finest: bool, fast: bool = False) -> Scale:
     """Part a scale's bands from (B, C, h, w), the image if ``finest``, by compiled steps."""
-    here = plane
-    if finest:
-        rows = step(_parted_rows, plane, fast)(plane)
-        here = step(_parted_columns, plane, fast)(rows)
-    lowpass = reduced(here, fast)
-    around = expanded(lowpass, (here.shape[-2], here.shape[-1]), fast)
+    here = _smooth(plane, fast) if finest else plane
+    rest = reduced(here, fast)
+    around = expanded(rest, (here.shape[-2], here.shape[-1]), fast)
     band = here - around
-    return Scale((plane - here, band) if finest else (band,), around, lowpass)
+    return Scale((plane - here, band) if finest else (band,), around, rest)
+
+
+def _smooth(image: Tensor, fast: bool) -> Tensor:
+    """Return an image without its finest band."""
+    rows = step(_parted_rows, image, fast)(image)
+    smooth: Tensor = step(_parted_columns, image, fast)(rows)
+    return smooth
 
 
 def gathered(planes: Sequence[Tensor], fast: bool = False) -> Tensor:
