@@ -162,21 +162,23 @@ class Model:
             In JND. Where a quarter of the draws lie over it on average, the rest is left out: it
             is not the end, and only then the prediction must be good.
         """
-        factor = _factor(torch.from_numpy(self.single / self.count)).float()
+        factor = _factor(torch.from_numpy(self.single / self.count))
+        # From normal numbers to S, M, L at once.
+        mixing = torch.einsum("ij,jkhw->ikhw", self.to_cones, factor).float()
         generator = np.random.Generator(np.random.Philox(0))
         height, width = self.size
         if draws is None:
             draws = min(max(SIMULATED // (height * width), FEWEST_DRAWS), MOST_DRAWS)
         few = max(draws // 4, 2)
         step = min(max(1, AT_ONCE // (3 * height * width)), few)
-        truth, to_cones = _each(self.truth, Tensor.float), self.to_cones.float()
+        truth = _each(self.truth, Tensor.float)
         largest = np.empty(0)
         visible = torch.zeros((), dtype=torch.float64)
         while len(largest) < draws and not (len(largest) >= few and largest.mean() > tolerance):
             batch = min(step, draws - len(largest))
             normal = generator.standard_normal((batch, 3, height, width), np.float32)
-            noise = torch.einsum("ijhw,bjhw->bihw", factor, torch.from_numpy(normal))
-            noise = torch.einsum("ij,bjhw->bihw", to_cones, noise)
+            # No matrix products, of which there would be one a pixel.
+            noise = (mixing * torch.from_numpy(normal)[:, None]).sum(2)
             added = self.metric.transform.decompose(noise, true_means=self.true_means)
             first = _batch(truth, batch)
             second = Cortex(
@@ -200,7 +202,7 @@ class Model:
         simulated totals over that of its own.
         """
         self.correction = None
-        totals = self._totals(self.variance, self.truth)
+        totals = self.totals()
         pooled, own = (
             functional.avg_pool2d(
                 plane, 2 * SURROUNDINGS + 1, 1, SURROUNDINGS, count_include_pad=False
