@@ -33,6 +33,9 @@ TILE = 28
 # and of a tile's, nothing is left over, in nodes and in their parents. Status: measured, AVX-512.
 ROWS, COLUMNS = 16, 8
 
+# Most nodes from left to right in a strip. Status: choice.
+WIDEST = 508
+
 # Numbers of the pieces that are computed at once. More would be computed by other steps of the
 # metric, with other last bits. Status: choice, as in `torch_vdm.vdm`.
 AT_ONCE = 2**18
@@ -84,11 +87,9 @@ class _Level:
         self.size = height, width = details.shape[-2], details.shape[-1]
         self.finest = finest
         self.tiles = _Cut(TILE, TILE, -(-height // TILE), -(-width // TILE))
-        columns = _up(width + 2 * HALO, COLUMNS)
-        most = max(AT_ONCE // (9 * columns) // ROWS * ROWS, ROWS) - 2 * HALO
-        strips = -(-height // most)
-        rows = _up(-(-height // strips) + 2 * HALO, ROWS) - 2 * HALO
-        self.strips = _Cut(rows, columns - 2 * HALO, -(-height // rows), 1)
+        columns = _side(width, WIDEST, COLUMNS)
+        rows = _side(height, AT_ONCE // (9 * (columns + 2 * HALO)) - 2 * HALO, ROWS)
+        self.strips = _Cut(rows, columns, -(-height // rows), -(-width // columns))
         down = max(cut.rows * cut.down for cut in (self.tiles, self.strips)) - height
         right = max(cut.columns * cut.across for cut in (self.tiles, self.strips)) - width
         self._sides = (HALO, HALO + right, HALO, HALO + down)
@@ -242,5 +243,8 @@ def _touched(variance: Tensor, before: Tensor, tiles: _Cut) -> list[Place]:
     return [(int(y), int(x)) for y, x in found.nonzero().tolist()]
 
 
-def _up(number: int, multiple: int) -> int:
-    return -(-number // multiple) * multiple
+def _side(nodes: int, most: int, multiple: int) -> int:
+    """Return the side of as few equal pieces as cover so many nodes, a multiple with the halo."""
+    most = (most + 2 * HALO) // multiple * multiple - 2 * HALO
+    each = -(-nodes // -(-nodes // most))
+    return -(-(each + 2 * HALO) // multiple) * multiple - 2 * HALO

@@ -13,8 +13,8 @@ from sampling.statistics import Statistics
 from sampling.tiles import PAYS, TILE, local_errors
 from torch_vdm import VDM, Display, Observer
 
-# Of one and two fine levels; odd and even sides, more of one than of the other, and the smallest.
-SIZES = [(130, 130), (131, 157), (300, 97), (259, 261)]
+# Of one and two fine levels; odd and even sides, more of one than of the other, wider than a strip.
+SIZES = [(130, 130), (131, 157), (300, 97), (259, 261), (34, 1301)]
 OBSERVERS = [Observer.calibrated(), Observer.paper()]
 each_observer = pytest.mark.parametrize("observer", OBSERVERS, ids=lambda o: o.name)
 each_size = pytest.mark.parametrize("size", SIZES, ids=str)
