@@ -156,11 +156,14 @@ class LocalErrors:
         return tuple(local)
 
     def touched(self, leaves: Tensor) -> float:
-        """Return the share of tiles, of all levels that have any, which these variances touch."""
+        """Return the share of tiles that these variances touch, of all levels that have any."""
         variances = detail_variances(leaves, self._metric.observer.true_means)
-        both = zip(self._levels, variances[-len(self._levels) :], self._variances, strict=True)
-        found = [len(_touched(one, other, level.tiles)) for level, one, other in both]
-        return sum(found) / sum(len(level.tiles.places()) for level in self._levels)
+        fine = variances[len(self._coarse.details) :]
+        found = [
+            len(_touched(variance, before, level.tiles))
+            for level, variance, before in zip(self._levels, fine, self._variances, strict=True)
+        ]
+        return sum(found) / max(sum(len(level.tiles.places()) for level in self._levels), 1)
 
     def _computed(
         self,
