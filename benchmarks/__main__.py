@@ -11,10 +11,12 @@ BENCHMARKS = {
     "30 seconds with --quick",
     "calibrate": "fit the observer to human thresholds; 15 minutes, 1 with --quick",
     "large": "memory on images up to 16,384 x 16,384; 15 minutes, 15 seconds with --quick",
+    "overhead": "what deciding costs beside rendering; 10 minutes, 10 seconds with --quick",
     "paper": "Figures 9 to 14, and real scenes; 60 minutes, 30 seconds with --quick",
     "speed": "time and memory beside kornia's SSIM; 6 minutes, 1 with --quick",
     "stability": "hard images in every precision; 10 minutes, 15 seconds with --quick",
     "stopping": "whether the sampler stops honestly; 30 minutes, 10 seconds with --quick",
+    "tiles": "what skipping untouched tiles saves; 1 minute, 10 seconds with --quick",
     "training": "a denoiser trained with each loss; 30 minutes, 30 seconds with --quick",
 }
 

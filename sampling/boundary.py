@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from torch_vdm.cortex import Cortex
 from torch_vdm.quadtree import share
@@ -47,15 +48,23 @@ def detail_variances(leaves: Tensor, true_means: bool) -> tuple[Tensor, ...]:
     Returns
     -------
     tuple of Tensor
-        One (B, C, 3, h, w) a level, level 0 first: d1 (horizontal), d2 (vertical), d3 (diagonal).
+        One (B, C, 3, h, w) a level, level 0 first: d1 (horizontal), d2 (vertical), d3 (diagonal);
+        (B, C, 1, h, w) where all three have the same.
     """
     size = (leaves.shape[-2], leaves.shape[-1])
     levels: list[Tensor] = []
     nodes = leaves
     while max(nodes.shape[-2:]) > 1:
+        if _complete(size, 2 ** len(levels), nodes, true_means):
+            nodes = functional.avg_pool2d(nodes, 2) * 0.25
+            levels.append(nodes.unsqueeze(2))
+            continue
         y, x = (
-            _axis(side, 2 ** len(levels), nodes.shape[axis], true_means)
-            for side, axis in zip(size, (-2, -1), strict=True)
+            _Axis(index, *(weights.to(nodes) for weights in of_squares))
+            for index, *of_squares in (
+                _axis(side, 2 ** len(levels), nodes.shape[axis], true_means)
+                for side, axis in zip(size, (-2, -1), strict=True)
+            )
         )
         upper, lower = nodes[..., y.nodes[0], :], nodes[..., y.nodes[1], :]
 
@@ -75,6 +84,14 @@ def detail_variances(leaves: Tensor, true_means: bool) -> tuple[Tensor, ...]:
         left, right = across(y.own)
         nodes = x.own[0] * left + x.own[1] * right
     return tuple(reversed(levels))
+
+
+def _complete(size: tuple[int, int], node: int, nodes: Tensor, true_means: bool) -> bool:
+    """Return whether all parents of nodes of ``node`` pixels have four, of all their pixels."""
+    return all(
+        nodes.shape[axis] % 2 == 0 and not (true_means and share(side, node) < 1.0)
+        for side, axis in zip(size, (-2, -1), strict=True)
+    )
 
 
 def _axis(side: int, node: int, count: int, true_means: bool) -> _Axis:

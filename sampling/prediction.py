@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from sampling.boundary import NONE, QUARTILE, boundaries, detail_variances
+from sampling.boundary import NONE, detail_variances
 from sampling.error import maximum, total
 from sampling.statistics import FIRST, SECOND, Statistics
+from sampling.tiles import LocalErrors, local_errors
 from sampling.variance import pooled_covariance
 from torch_vdm import VDM
 from torch_vdm.cortex import Cortex
@@ -72,7 +73,9 @@ class Model:
         with torch.no_grad():
             self.cortex = metric.represent(self.mean)
         self.to_cones = _to_cones(metric)
-        self.variance = self._cone_variance(self.count)
+        # Of a single sample, and of the mean of them.
+        self.single_variance = self._cone_variance()
+        self.variance = self.single_variance / torch.from_numpy(self.count)
         # Of the totals of the boundary images, once there are simulated ones to correct them by.
         self.correction: Tensor | None = None
         self.details = detail_variances(self.variance, self.true_means)
@@ -85,8 +88,21 @@ class Model:
         pixel so many samples.
         """
         with torch.no_grad():
-            variance = self.variance if count is None else self._cone_variance(count)
-            return self._totals(variance, self.truth)
+            return self._corrected(self.errors.at(self.leaves(count)))
+
+    def leaves(self, count: NDArray[np.float64] | None = None) -> Tensor:
+        """Return the variance of each pixel as `errors` takes it, (1, 3, H, W), single precision.
+
+        With ``count``, (H, W), what it would be had each pixel so many samples.
+        """
+        samples = torch.from_numpy(self.count if count is None else count)
+        return self.single_variance.float() / samples.float()
+
+    @cached_property
+    def errors(self) -> LocalErrors:
+        """The local errors of the boundary images for any number of samples."""
+        with torch.no_grad():
+            return LocalErrors(self.metric, self.truth, self.leaves())
 
     @cached_property
     def textured(self) -> Cortex:
@@ -121,17 +137,11 @@ class Model:
         return slopes / slopes.sum().clamp_min(1e-300)
 
     def _totals(self, variance: Tensor, truth: Cortex) -> Tensor:
-        lower, upper = boundaries(
-            truth,
-            detail_variances(variance, self.true_means),
-            variance.mean((-2, -1), keepdim=True) / variance[0, 0].numel(),
-            QUARTILE,
-            self.metric.observer.signed,
-        )
-        root = self.metric.lowpass_difference(lower, upper) ** self.exponent
-        first, *others = self.metric.local_differences(lower, upper) or (0.0,)
-        local = (first + root.sum(1, keepdim=True), *others)
-        finest = total(local, maximum(local))[-1]
+        variances = detail_variances(variance, self.true_means)
+        return self._corrected(local_errors(self.metric, truth, variances, variance))
+
+    def _corrected(self, local: tuple[Tensor, ...]) -> Tensor:
+        finest = total(local, maximum(local))[-1].double()
         return finest if self.correction is None else finest * self.correction
 
     @torch.no_grad()
@@ -152,21 +162,23 @@ class Model:
             In JND. Where a quarter of the draws lie over it on average, the rest is left out: it
             is not the end, and only then the prediction must be good.
         """
-        factor = _factor(torch.from_numpy(self.single / self.count)).float()
+        factor = _factor(torch.from_numpy(self.single / self.count))
+        # From normal numbers to S, M, L at once.
+        mixing = torch.einsum("ij,jkhw->ikhw", self.to_cones, factor).float()
         generator = np.random.Generator(np.random.Philox(0))
         height, width = self.size
         if draws is None:
             draws = min(max(SIMULATED // (height * width), FEWEST_DRAWS), MOST_DRAWS)
         few = max(draws // 4, 2)
         step = min(max(1, AT_ONCE // (3 * height * width)), few)
-        truth, to_cones = _each(self.truth, Tensor.float), self.to_cones.float()
+        truth = _each(self.truth, Tensor.float)
         largest = np.empty(0)
         visible = torch.zeros((), dtype=torch.float64)
         while len(largest) < draws and not (len(largest) >= few and largest.mean() > tolerance):
             batch = min(step, draws - len(largest))
             normal = generator.standard_normal((batch, 3, height, width), np.float32)
-            noise = torch.einsum("ijhw,bjhw->bihw", factor, torch.from_numpy(normal))
-            noise = torch.einsum("ij,bjhw->bihw", to_cones, noise)
+            # No matrix products, of which there would be one a pixel.
+            noise = (mixing * torch.from_numpy(normal)[:, None]).sum(2)
             added = self.metric.transform.decompose(noise, true_means=self.true_means)
             first = _batch(truth, batch)
             second = Cortex(
@@ -190,7 +202,7 @@ class Model:
         simulated totals over that of its own.
         """
         self.correction = None
-        totals = self._totals(self.variance, self.truth)
+        totals = self.totals()
         pooled, own = (
             functional.avg_pool2d(
                 plane, 2 * SURROUNDINGS + 1, 1, SURROUNDINGS, count_include_pad=False
@@ -208,12 +220,12 @@ class Model:
         mean = float(largest.mean())
         return mean + QUANTILE * math.hypot(float(largest.std(ddof=1)), INEXACT * mean)
 
-    def _cone_variance(self, count: NDArray[np.float64] | NDArray[np.int64]) -> Tensor:
-        """Return the variance of each pixel's mean in S, M, L, (1, 3, H, W)."""
+    def _cone_variance(self) -> Tensor:
+        """Return the variance of a single sample of each pixel in S, M, L, (1, 3, H, W)."""
         # The diagonal of M C M^T.
         matrix = self.to_cones.numpy()
         weights = matrix[:, FIRST] * matrix[:, SECOND] * np.where(FIRST == SECOND, 1.0, 2.0)
-        variance = np.einsum("ck,khw->chw", weights, self.single) / count
+        variance = np.einsum("ck,khw->chw", weights, self.single)
         return torch.from_numpy(np.maximum(variance, 0.0))[None]
 
 

@@ -77,12 +77,14 @@ class Statistics:
             raise ValueError(f"expected radiance of shape ({len(pixels)}, 3), got {radiance.shape}")
         if len(pixels) == 0:
             return
-        steps = np.diff(pixels)
-        if pixels[0] < 0 or pixels[-1] >= len(self.drawn) or (steps < 0).any():
+        backwards = (pixels[1:] < pixels[:-1]).any()
+        if pixels[0] < 0 or pixels[-1] >= len(self.drawn) or backwards:
             raise ValueError(f"expected sorted pixel numbers from 0 to {len(self.drawn) - 1}")
         starts, lengths = _runs(pixels)
         cuts = self._cuts(pixels[starts], starts, lengths)
-        ends = np.union1d(np.append(starts[1:], len(pixels)), cuts)
+        ends = np.append(starts[1:], len(pixels))
+        if len(cuts) > 0:
+            ends = np.union1d(ends, cuts)
         # Whole runs at a time, about as many samples as stay in the processor's cache, and never
         # two pieces of one run.
         start = 0
@@ -153,13 +155,15 @@ class Statistics:
         """Fold in whole runs."""
         starts, lengths = _runs(pixels)
         runs = pixels[starts]
-        finite = np.isfinite(radiance).all(1)
+        # Of all numbers at once: which samples are meant is asked only where one is not finite.
+        every = bool(np.isfinite(radiance).all())
+        finite = np.ones(1, np.bool_) if every else np.isfinite(radiance).all(1)
         if self.half_count is not None:
             number = np.arange(len(pixels)) - np.repeat(starts - self.drawn[runs], lengths)
             self._add_halves(pixels, radiance, finite & (number % 2 == 0))
-        before = self.count[runs].astype(np.float64)
+        before = (self.drawn[runs] - self.nonfinite[runs]).astype(np.float64)
         self.drawn[runs] += lengths
-        if not finite.all():
+        if not every:
             np.add.at(self.nonfinite, pixels[~finite], 1)
             pixels, radiance = pixels[finite], radiance[finite]
             if len(pixels) == 0:
@@ -168,7 +172,10 @@ class Statistics:
             before = before[kept]
             starts, lengths = _runs(pixels)
             runs = pixels[starts]
-        self._fold(runs, before, *_reduce(radiance, starts, lengths))
+        # Neighbours are reached much faster as a slice.
+        beside = runs[-1] - runs[0] == len(runs) - 1
+        where = slice(int(runs[0]), int(runs[-1]) + 1) if beside else runs
+        self._fold(where, before, *_reduce(radiance, starts, lengths))
 
     def _add_halves(
         self, pixels: NDArray[np.int64], radiance: NDArray[np.float32], kept: NDArray[np.bool_]
@@ -218,7 +225,7 @@ class Statistics:
 
 def _runs(pixels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return where the runs of equal numbers start, and their lengths."""
-    starts = np.concatenate(([0], np.flatnonzero(np.diff(pixels)) + 1))
+    starts = np.concatenate(([0], np.flatnonzero(pixels[1:] != pixels[:-1]) + 1))
     return starts, np.diff(np.append(starts, len(pixels)))
 
 
@@ -243,10 +250,10 @@ def _reduce(
     About the run's first sample, so that a constant pixel has exactly no variance and a bright
     one loses no digits; the differences of single-precision numbers are exact.
     """
-    columns = radiance.T
+    shifted: Plane = radiance.T.astype(np.float64, order="C")
     count = lengths.astype(np.float64)
-    origin = columns[:, starts].astype(np.float64)
-    shifted: Plane = columns.astype(np.float64) - np.repeat(origin, lengths, axis=1)
+    origin = shifted[:, starts]
+    shifted -= np.repeat(origin, lengths, axis=1)
     mean = np.add.reduceat(shifted, starts, axis=1) / count
     comoments = np.empty((6, len(starts)))
     for row, (one, other) in enumerate(zip(FIRST, SECOND, strict=True)):

@@ -7,7 +7,16 @@ from numpy.typing import NDArray
 from sampling.prediction import Model
 from sampling.renderers.synthetic import Synthetic
 from sampling.statistics import Statistics
-from sampling.strategies import LARGEST_GROWTH, STRATEGIES, HalfBuffer
+from sampling.strategies import (
+    CLOSE,
+    CLOSE_BELOW,
+    LARGEST_GROWTH,
+    SMALLEST_GROWTH,
+    STRATEGIES,
+    HalfBuffer,
+    _grown,
+    _growth,
+)
 from torch_vdm import VDM, Display, Observer
 
 Plane = NDArray[np.float64]
@@ -191,3 +200,30 @@ def test_the_half_buffer_needs_halves() -> None:
     renderer = masking()
     with pytest.raises(ValueError, match="halves"):
         HalfBuffer().noise(drawn(renderer, halves=False), renderer.size)
+
+
+@both_observers
+@pytest.mark.parametrize("share", [1.1, 0.999, 0.9, 0.5, 0.2, 0.02, 1e-6])
+@pytest.mark.parametrize("even", [False, True])
+def test_the_growth_is_the_smallest_that_is_enough(observer: str, share: float, even: bool) -> None:
+    """Against a fine bisection, for pixels of like and of unlike worth."""
+    renderer = masking()
+    model = Model(METRICS[observer], drawn(renderer), renderer.size)
+    worth = np.ones(renderer.size) if even else np.random.default_rng(3).random(renderer.size)
+    goal = share * float(model.totals().max())
+
+    def enough(growth: float) -> bool:
+        return float(model.totals(_grown(model, worth, growth)).max()) <= goal
+
+    low, high = 0.0, float(np.log(LARGEST_GROWTH))
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if enough(middle) else (middle, high)
+    found = _growth(model, worth, goal)
+    smallest, largest = np.log([SMALLEST_GROWTH, LARGEST_GROWTH])
+    assert smallest <= found <= largest
+    assert found == largest or enough(found)
+    if found > max(high, smallest) + CLOSE:
+        # Farther than that only where the prediction hardly moves.
+        total = float(model.totals(_grown(model, worth, found)).max())
+        assert np.log(total / goal) > -CLOSE_BELOW
