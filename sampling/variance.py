@@ -2,7 +2,8 @@
 
 Where a pixel's first samples all miss a small light, their variance is 0. What its neighbours saw
 is then the better estimate. Every node of the quad-tree has a pooled variance; from the root down,
-each is mixed with its parent's (empirical Bayes), by how much each of them knows.
+each is mixed with its parent's (empirical Bayes), by how much each of them knows; where its own
+samples refute the parent's, it is left alone.
 """
 
 import numpy as np
@@ -29,6 +30,17 @@ FARTHEST = 4.0
 # A node is at most so many times as bright as its parent, the mean of four. More is left over where
 # a channel is 0 but for rounding, as in a saturated colour.
 LARGEST_SCALE = 4.0
+
+# A prior is dropped where chance would leave any node of a level so far under it in no more than
+# this share of images. Status: choice.
+SIGNIFICANCE = 0.05
+
+# A prior of no more than so many times the own variance is not doubted. Status: choice.
+CLOSE = 2.0
+
+# A node that has shown no light at all refutes with so many times fewer events: a part of it may
+# be lit. Status: choice, measured.
+BLACK = 8.0
 
 # Kurtosis of normal noise, where none has been seen.
 NORMAL = 3.0
@@ -63,8 +75,15 @@ def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
         # noise but neither its light nor the kurtosis of it.
         kurtosis = _ratio(parent[6], between[13], NORMAL)
         freedom = 2.0 * nodes[11] / np.maximum(kurtosis - 1.0, 1e-3)
+        # A chance of p has a kurtosis of 1 / (p (1 - p)) - 3.
+        events = nodes[11] / (kurtosis + 3.0)
+        seen = scalar_second(own[:6])
+        # What is black has a rule of its own, below; its mean is believed late.
+        lit = (own[:6] != 0.0).any(0) | (own_mean != 0.0).any(0)
         # The mean, which scales what the parents know, is shrunk by the least weight.
         weight = PRIOR / (PRIOR + freedom)
+        doubtful = np.where(lit, events, events / BLACK)
+        weight *= _unrefuted(seen, scalar_second(parent[:6]), doubtful)
         mean = weight * parent_mean + (1.0 - weight) * own_mean
         chance = (1.0 - weight) ** 2 * parent[:6][FIRST == SECOND] / np.maximum(nodes[11], 1.0)
         known = np.sqrt(between[10:13] + chance)
@@ -72,8 +91,10 @@ def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
         covariance = parent[:6] * scale[FIRST] * scale[SECOND]
         fourth = kurtosis * scalar_second(covariance) ** 2
         prior = np.concatenate((covariance, fourth[None]))
-        worth = _worth(scalar_second(own[:6]), scalar_second(prior[:6]), freedom)
-        weight = _chance_of_light(own, own_mean, freedom) * worth / (worth + freedom)
+        known_second = scalar_second(prior[:6])
+        worth = _worth(seen, known_second, freedom)
+        believed = np.where(lit, _unrefuted(seen, known_second, events), _chance_of_light(freedom))
+        weight = believed * worth / (worth + freedom)
         estimate = weight * prior + (1.0 - weight) * own
     return estimate[:6]
 
@@ -90,8 +111,27 @@ def _worth(own: Plane, prior: Plane, freedom: Plane) -> Plane:
     return np.clip(2.0 / np.maximum(spread, 1e-9), PRIOR, LARGEST_PRIOR)
 
 
-def _chance_of_light(own: Plane, mean: Plane, freedom: Plane) -> Plane:
-    """Return how likely it is that a node has light at all: 1 where it has shown any.
+def _unrefuted(own: Plane, prior: Plane, events: Plane) -> Plane:
+    """Return how much of a prior the nodes' own variances leave, 1 to 0.
+
+    Had they the prior's noise, at least ``events`` events would be expected of it. That no more
+    than what was seen come of them has a chance of exp(-D) at most, D the deviance of a Poisson
+    number (Chernoff), where `CLOSE` times as many stand for what was seen; times the nodes of the
+    level, that any of them falls so low. All of the prior is left where this is 1, none where it is
+    `SIGNIFICANCE`.
+    Without it a lamp in one pixel was believed of the whole image: what was left of it by the
+    weight of the nodes' own samples, next to nothing of many thousand times their noise, came down
+    to the pixels with a kurtosis that none of them could refute.
+    """
+    share = np.minimum(CLOSE * _ratio(own, prior, 1.0), 1.0)
+    entropy = share * np.log(np.where(share > 0.0, share, 1.0))
+    chance = own.size * np.exp(-events * (1.0 - share + entropy))
+    left: Plane = np.clip((chance - SIGNIFICANCE) / (1.0 - SIGNIFICANCE), 0.0, 1.0)
+    return left
+
+
+def _chance_of_light(freedom: Plane) -> Plane:
+    """Return how likely it is that a node that has shown no light has any.
 
     What is black is as a rule the background, or a black surface, and no sample will change it. Had
     a share of the node, whichever, its parent's light, it would show none in ``freedom`` / 2
@@ -99,8 +139,8 @@ def _chance_of_light(own: Plane, mean: Plane, freedom: Plane) -> Plane:
     Without this a black background beside a light that is seldom hit took most samples, for there
     is nothing in it that noise could hide behind.
     """
-    shown = (own[:6] != 0.0).any(0) | (mean != 0.0).any(0)
-    return np.where(shown, 1.0, 1.0 / np.maximum(1.0, 0.5 * freedom))
+    chance: Plane = 1.0 / np.maximum(1.0, 0.5 * freedom)
+    return chance
 
 
 def _smooth(plane: Plane) -> Plane:

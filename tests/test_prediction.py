@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sampling.prediction import MOST_DRAWS, Model, _factor, _shrunk, _textured
+from sampling.prediction import EVEN, MOST_DRAWS, Model, _factor, _shrunk, _textured
 from sampling.renderers.synthetic import Synthetic
 from sampling.statistics import FIRST, SECOND, Statistics
 from torch_vdm import VDM, Display, Observer
@@ -112,7 +112,7 @@ def test_slopes_are_the_derivative_of_the_largest_totals(observer: Observer) -> 
 
 @each_observer
 def test_shares_are_of_the_plain_and_the_textured_image(observer: Observer) -> None:
-    """Half and half, in units of the whole; none where there is no noise."""
+    """Half and half, but for what is even; none where there is no noise."""
     event = np.zeros((16, 16, 3))
     event[:, 8:] = 0.1
     renderer = Synthetic(np.full((16, 16, 3), 0.2), event, np.full((16, 16), 0.5))
@@ -120,10 +120,12 @@ def test_shares_are_of_the_plain_and_the_textured_image(observer: Observer) -> N
     model.variance[..., :8] = 0.0
     shares = model.shares()
     assert shares.sum() == pytest.approx(1.0)
-    assert (shares[:, :8] == 0.0).all()
-    assert (shares[:, 8:] > 0.0).any()
+    assert (shares[:, :6] == 0.0).all()
     for truth in (model.truth, model.textured):
-        assert (shares >= 0.5 * model._slopes(truth).numpy()).all()
+        assert (shares >= 0.5 * (1.0 - EVEN) * model._slopes(truth).numpy()).all()
+    # A pixel that has shown noise has as much of what is even as any other, and the two columns
+    # beside them, for its neighbours may have been unlucky.
+    assert shares[:, 6:].min() >= EVEN / (10 * 16) - 1e-12
 
 
 @each_observer

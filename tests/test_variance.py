@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from sampling.renderers import Samples
 from sampling.renderers.synthetic import Synthetic
 from sampling.statistics import FIRST, SECOND, Statistics
-from sampling.variance import pooled_covariance
+from sampling.variance import SIGNIFICANCE, _unrefuted, pooled_covariance
 
 
 def drawn(renderer: Synthetic, count: int) -> Statistics:
@@ -160,3 +160,39 @@ def test_a_black_background_beside_a_seldom_hit_light_is_known_to_be_black() -> 
     unlit = (statistics.mean[0].reshape(size) == 0.0)[:, :16]
     assert unlit.any()
     assert pooled[:, :16][unlit].min() > 1e-3 * true
+
+
+def test_a_lamp_in_one_pixel_is_not_believed_of_the_whole_image() -> None:
+    """A tenth of one pixel shows a lamp of 3000; the wall's own noise is next to nothing.
+
+    The prior of the whole image has a kurtosis that no pixel can refute by itself: what the nodes
+    left of it made the wall's variance ten thousand times the truth and more.
+    """
+    base, event = np.full((32, 32, 3), 0.3), np.full((32, 32, 3), 0.1)
+    chance = np.full((32, 32), 0.5)
+    base[3, 4], event[3, 4], chance[3, 4] = 0.0, 3000.0, 0.1
+    renderer = Synthetic(base, event, chance, 1)
+    found = green(pooled_covariance(drawn(renderer, 1024), renderer.size))
+    ratio = found / renderer.covariance[..., 1, 1]
+    # Around the lamp some doubt is left.
+    assert (ratio < 1.1).mean() > 0.85
+    assert ratio[16:, 16:].max() < 1.1
+    assert ratio.min() > 0.9
+    assert ratio[3, 4] > 0.5
+
+
+def test_a_prior_is_dropped_only_where_chance_would_not_fall_so_far_under_it() -> None:
+    one = np.ones((16, 16))
+    # Few expected events, or a variance near the prior: all of it is left.
+    for own, events in ((0.0, 1.0), (0.0, 5.0), (0.5, 1e4), (1.0, 1e4), (3.0, 1e4)):
+        assert (_unrefuted(own * one, one, events * one) == 1.0).all()
+    # None seen of n: exp(-n), in any of 256 nodes.
+    bound = np.log(one.size / SIGNIFICANCE)
+    assert (_unrefuted(0.0 * one, one, (bound - 0.1) * one) > 0.0).all()
+    assert (_unrefuted(0.0 * one, one, (bound + 0.1) * one) == 0.0).all()
+    # Of nodes that are like the prior, hardly any is refuted in any image.
+    rng = np.random.default_rng(11)
+    for events in (4.0, 8.0, 16.0, 32.0):
+        seen = rng.poisson(events, (400, 16, 16)) / events
+        dropped = [bool((_unrefuted(own, one, events * one) == 0.0).any()) for own in seen]
+        assert np.mean(dropped) <= SIGNIFICANCE
