@@ -58,7 +58,7 @@ REFERENCE_SEED = 1_000_000
 REFERENCE_SHARE = 0.25
 
 # It may take so many times as long as a run, and so many times the samples. Status: choice.
-REFERENCE_TIMES = 4.0
+REFERENCE_TIMES = 12.0
 
 # Strategies that decide without the metric.
 NEED_NO_METRIC = ("uniform", "halfbuffer")
