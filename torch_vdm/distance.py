@@ -39,13 +39,14 @@ def local_visual_difference(difference: Tensor, exponent: Tensor) -> Tensor:
     return (size * size * rest).sum((1, 2)).unsqueeze(1)
 
 
-def local_visual_difference_of_energy(energy: Tensor, exponent: Tensor) -> Tensor:
+def local_visual_difference_of_energy(energy: Tensor, count: float, exponent: Tensor) -> Tensor:
     """Return the local visual difference of squared differences: their power of exponent / 2.
 
-    Arguments as `local_visual_difference`, whose square ``energy`` is.
+    Arguments as `local_visual_difference`, whose square ``energy`` is the sum over ``count`` of.
     """
     rest = torch.exp2((0.5 * exponent - 1.0) * torch.log2(energy.clamp_min(SMALLEST_DIFFERENCE)))
-    return (energy * rest).sum((1, 2)).unsqueeze(1)
+    # Divided when there is one plane left.
+    return (energy * rest).sum((1, 2)).unsqueeze(1) / count ** (0.5 * exponent)
 
 
 def accumulate(local: Sequence[Tensor], root: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """The fast route: functions of planes, compiled once for every size."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -45,19 +46,33 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     def call(*arguments: object) -> Any:
         if torch.compiler.is_compiling():
             return function(*arguments)
-        # Set and restored by hand: the context managers for it cost as much as the call.
-        before = shapes.use_duck_shape, dynamo.recompile_limit
-        # Else two sides that are equal in the first image would be held equal for ever, and the
-        # first image that is not square would compile everything again.
-        shapes.use_duck_shape = False
-        # For every mix of precision, gradients, display, observer and effects in one process.
-        dynamo.recompile_limit = MOST_FORMS
-        try:
+        if not shapes.use_duck_shape and dynamo.recompile_limit >= MOST_FORMS:
             return specialised(*arguments)
-        finally:
-            shapes.use_duck_shape, dynamo.recompile_limit = before
+        with for_any_size():
+            return specialised(*arguments)
 
     return call
+
+
+@contextmanager
+def for_any_size() -> Iterator[None]:
+    """Let forms be compiled for any size, and many of them be kept.
+
+    Every call does so by itself; around many calls it costs less than around each.
+    """
+    from torch._dynamo import config as dynamo
+    from torch.fx.experimental import _config as shapes
+
+    before = shapes.use_duck_shape, dynamo.recompile_limit
+    # Else two sides that are equal in the first image would be held equal for ever, and the first
+    # image that is not square would compile everything again.
+    shapes.use_duck_shape = False
+    # For every mix of precision, gradients, display, observer and effects in one process.
+    dynamo.recompile_limit = max(MOST_FORMS, dynamo.recompile_limit)
+    try:
+        yield
+    finally:
+        shapes.use_duck_shape, dynamo.recompile_limit = before
 
 
 def step(function: Callable[..., Any], plane: Tensor, fast: bool) -> Callable[..., Any]:

@@ -1,6 +1,7 @@
 """What every metric of two images shares: its options, its checks, its precision."""
 
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from typing import Any, Literal, Self
 
 import torch
@@ -10,6 +11,7 @@ from torch.utils.checkpoint import checkpoint
 
 from torch_vdm.display import Display
 from torch_vdm.distance import just_noticeable
+from torch_vdm.fast import for_any_size
 from torch_vdm.memory import keep_freed_memory
 
 Nonfinite = Literal["raise", "mask"]
@@ -127,7 +129,9 @@ class PairMetric(nn.Module):
         return {name: value.to(dtype) for name, value in buffers.items()}
 
     def _total(self, test: Tensor, reference: Tensor) -> Tensor:
-        totals = [self._accumulated(one, other) for one, other in self._parts(test, reference)]
+        fast = self._fast and not torch.compiler.is_compiling()
+        with for_any_size() if fast else nullcontext():
+            totals = [self._accumulated(one, other) for one, other in self._parts(test, reference)]
         return torch.cat(totals)
 
     def _parts(self, test: Tensor, reference: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

@@ -746,7 +746,12 @@ def _band_sensitivity(lowpass: Tensor, table: Tensor, constants: dict[str, Tenso
     place = (torch.log2(seen[:, 0]) - LUMINANCES[0]).clamp(0.0, last)
     low = place.detach().floor().clamp_max(last - 1.0)
     index, rest = low.long(), place - low
-    return torch.lerp(table[:, index], table[:, index + 1], rest).transpose(0, 1)
+    # Selected from columns, and not by an index of any shape, which takes four times as long.
+    before, after = (
+        table.index_select(1, column.flatten()).unflatten(1, place.shape)
+        for column in (index, index + 1)
+    )
+    return torch.lerp(before, after, rest).transpose(0, 1)
 
 
 def _band_contrast(
@@ -788,6 +793,6 @@ def _pooled_difference(
     those of overlapping nodes as energies that are pooled along rows.
     """
     if overlapping:
-        energy = pool_halves(surrounded, nodes, -2) / covering(nodes)
-        return local_visual_difference_of_energy(energy, exponent)
+        energy = pool_halves(surrounded, nodes, -2)
+        return local_visual_difference_of_energy(energy, covering(nodes), exponent)
     return local_visual_difference(pool(surrounded) if nodes > 1 else surrounded, exponent)

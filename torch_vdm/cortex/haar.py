@@ -142,6 +142,27 @@ def levels(
     return details, lowpass
 
 
+def lowpasses(
+    planes: Tensor, node: int, size: tuple[int, int], true_means: bool, count: int = DEEPEST
+) -> list[Tensor]:
+    """Return the lowpass that `levels` does, without the details."""
+    found: list[Tensor] = []
+    while max(planes.shape[-2:]) > 1 and len(found) < count:
+        if true_means:
+            planes = own(_means(complete(planes, size, node)), planes, size, node)
+        else:
+            planes = _means(pad_even(planes))
+        found.append(planes)
+        node *= 2
+    return found
+
+
+def _means(even: Tensor) -> Tensor:
+    """Return the lowpass of `_analyse` alone; faster than torch's own average of 2x2."""
+    sums = (even[..., 0::2, :] + even[..., 1::2, :]).mul_(0.25)
+    return sums[..., 0::2] + sums[..., 1::2]
+
+
 def _analyse(even: Tensor) -> tuple[Tensor, Tensor]:
     """Return the lowpass (B, C, h/2, w/2) and the details (B, C, 3, h/2, w/2) of a plane, Eq. 2."""
     top, bottom = even[..., 0::2, :], even[..., 1::2, :]

@@ -1,7 +1,6 @@
 """The Haar decomposition with shifts: nodes overlap, so that no place and no phase is preferred."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -12,7 +11,7 @@ from torch.nn import functional
 from torch_vdm.cortex.haar import (
     EXPONENT,
     Haar,
-    levels,
+    lowpasses,
     wavelet_response,
     window_response,
 )
@@ -68,9 +67,9 @@ class StationaryHaar:
         """
         size = (planes.shape[-2], planes.shape[-1])
         mean = mean_of(planes)
-        details, means = levels(planes, 1, size, fast, true_means)
+        means = lowpasses(planes, 1, size, true_means)
         # The means of nodes of 1, 1, 2, 4 ... pixels: halves of the finest, quarters of all others.
-        parts = [planes, planes, *means][: len(details)]
+        parts = [planes, planes, *means][: len(means)]
         if not parts:
             return Cortex((), (planes,), mean)
         return self._cortex(parts, 0, size, mean, fast, true_means)
@@ -80,7 +79,7 @@ class StationaryHaar:
     ) -> tuple[Cortex, Tensor]:
         """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
         size = (planes.shape[-2], planes.shape[-1])
-        _, means = levels(planes, 1, size, fast, true_means, count - 2)
+        means = lowpasses(planes, 1, size, true_means, count - 2)
         parts = [planes, planes, *means]
         none = planes[..., :1, :1]
         return self._cortex(parts, 0, size, none, fast, true_means), means[-1]
@@ -90,15 +89,20 @@ class StationaryHaar:
         return self.resume(base, fast, true_means)
 
     def reduced(
-        self, planes: Tensor, octaves: int, fast: bool = False, true_means: bool = False
+        self,
+        planes: Tensor,
+        octaves: int,
+        fast: bool = False,  # noqa: ARG002  # as in `decompose`
+        true_means: bool = False,
     ) -> Tensor:
         """Return the means of nodes of 2^octaves pixels; arguments as `decompose`."""
-        return Haar().reduced(planes, octaves, fast, true_means)
+        size = (planes.shape[-2], planes.shape[-1])
+        return [planes, *lowpasses(planes, 1, size, true_means, octaves)][octaves]
 
     def resume(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
         """Decompose the rest of an image; see `Transform.resume`."""
-        details, means = levels(base.plane, 2**base.octaves, base.size, fast, true_means)
-        parts = [base.plane, *means][: len(details) - 1]
+        means = lowpasses(base.plane, 2**base.octaves, base.size, true_means)
+        parts = [base.plane, *means][: len(means) - 1]
         return self._cortex(parts, base.octaves + 1, base.size, base.mean, fast, true_means)
 
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
@@ -150,28 +154,26 @@ def _faded(parts: Tensor, size: tuple[int, int], node: int) -> Tensor:
     return parts
 
 
-def _combined(corner: Callable[[int, int], Tensor], apart: int, means: bool) -> list[Tensor]:
+def _combined(
+    sums: tuple[Tensor, Tensor], differences: tuple[Tensor, Tensor], means: bool
+) -> list[Tensor]:
     """Return details and, with ``means``, lowpass, Eq. 2, of the four quarters of nodes.
 
-    ``corner`` gives a fourth of each quarter: so little is scaled.
+    Of a fourth of each the sums, left and right, and the differences, above and below.
     """
-    left, right = corner(0, 0), corner(0, apart)
-    top_sum, top_difference = left + right, left - right
-    left, right = corner(apart, 0), corner(apart, apart)
-    bottom_sum, bottom_difference = left + right, left - right
-    details = (
-        top_difference + bottom_difference,
-        top_sum - bottom_sum,
-        top_difference - bottom_difference,
-    )
-    return [torch.stack(details, 2), *([top_sum + bottom_sum] if means else [])]
+    details = (differences[0] + differences[1], sums[0] - sums[1], differences[0] - differences[1])
+    return [torch.stack(details, 2), *([sums[0] + sums[1]] if means else [])]
 
 
 def _halves(parts: Tensor, means: bool) -> list[Tensor]:
     """Return what `_combined` does of nodes of 2 x 2 parts that begin at every part."""
-    height, width = parts.shape[-2:]
     padded = functional.pad(0.25 * parts, (0, 1, 0, 1), mode="replicate")
-    return _combined(lambda y, x: padded[..., y : y + height, x : x + width], 1, means)
+    left, right = padded[..., :-1], padded[..., 1:]
+    # Every row is the upper one of a node and the lower one of another.
+    sums, differences = (
+        (rows[..., :-1, :], rows[..., 1:, :]) for rows in (left + right, left - right)
+    )
+    return _combined(sums, differences, means)
 
 
 def _quarters(parts: Tensor, means: bool) -> list[Tensor]:
@@ -191,7 +193,9 @@ def _quarters(parts: Tensor, means: bool) -> list[Tensor]:
             y, x = top + y, left + x
             return halves[..., y : y + 4 * rows - 3 : 4, x : x + 4 * columns - 3 : 4]
 
-        return _combined(corner, 2, means)
+        pairs = [(corner(y, 0), corner(y, 2)) for y in (0, 2)]
+        sums, differences = zip(*((one + two, one - two) for one, two in pairs), strict=True)
+        return _combined(sums, differences, means)
 
     four = nodes(0, 0), nodes(1, 3), nodes(2, 1), nodes(3, 2)
     return [_two_by_two(*planes)[..., :height, :width] for planes in zip(*four, strict=True)]
