@@ -258,7 +258,7 @@ def test_jnd_falls_with_samples_per_pixel(
 
 
 @pytest.mark.parametrize(
-    ("accuracy", "transform"), [("standard", StationaryHaar()), ("reference", Steerable())]
+    ("accuracy", "transform"), [("standard", StationaryHaar("filter")), ("reference", Steerable())]
 )
 def test_accuracy_is_the_transform(
     pair: Pair,

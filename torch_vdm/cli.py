@@ -47,10 +47,10 @@ WHITE = 100.0
 LARGEST_WHOLE = 2**24
 
 # How the image is decomposed: what accuracy costs.
-TRANSFORMS: dict[str, type[Transform]] = {
-    "fast": Haar,
-    "standard": StationaryHaar,
-    "reference": Steerable,
+TRANSFORMS: dict[str, Transform] = {
+    "fast": Haar(),
+    "standard": StationaryHaar("filter"),
+    "reference": Steerable(),
 }
 
 OBSERVERS = {"calibrated": Observer.calibrated, "paper": Observer.paper}
@@ -164,8 +164,8 @@ def _add_options(parser: argparse.ArgumentParser, map_path: Path | None) -> None
         "--accuracy",
         choices=tuple(TRANSFORMS),
         default="fast",
-        help="fast: the paper's Haar transform (default); standard: its shifts averaged, no "
-        "blocks; reference: oriented quadrature pairs, no phase",
+        help="fast: the paper's Haar transform (default); standard: its shifts averaged behind a "
+        "filter, no blocks, no direction; reference: oriented quadrature pairs",
     )
     model.add_argument("--observer", choices=tuple(OBSERVERS), default="calibrated")
     model.add_argument(
@@ -258,7 +258,7 @@ def _compare_with(room: Path, reference: Path, test: Path, options: argparse.Nam
     check_outputs((reference, test), (options.map, json_path(options)))
     ppd, seen_from = _viewing(options)
     pair = _load_pair(reference, test, options)
-    transform = TRANSFORMS[options.accuracy]()
+    transform = TRANSFORMS[options.accuracy]
     metric = VDM(ppd, pair.display, OBSERVERS[options.observer](), transform)
     tile = options.tile
     if tile is None and math.prod(pair.size) > LARGEST_WHOLE:
