@@ -29,7 +29,8 @@ from benchmarks.peers import Peer, clipped, installed
 from benchmarks.places import shared_data
 from benchmarks.speed import images, peak_megabytes
 from benchmarks.thresholds import Threshold, pattern, read_thresholds, render, sampling
-from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar, Steerable
+from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar
+from torch_vdm.cli import TRANSFORMS
 from torch_vdm.cortex import Transform
 
 Array = NDArray[np.float64]
@@ -63,11 +64,7 @@ PAPERS_RATIO = 60.0
 # Contenders that take no more seconds are timed in so many times as many rounds. Status: choice.
 QUICK_SECONDS, QUICK_ROUNDS = 1.0, 4
 
-RUNGS: dict[str, Transform] = {
-    "fast": Haar(),
-    "standard": StationaryHaar("filter"),
-    "reference": Steerable(),
-}
+RUNGS: dict[str, Transform] = {name: make() for name, make in TRANSFORMS.items()}
 HALFWAY: dict[str, Transform] = {
     "Haar, CSF before": Haar("filter"),
     "StationaryHaar": StationaryHaar(),

@@ -17,8 +17,8 @@ import torch
 
 from benchmarks.record import blank_figure, caption, circumstances, measured_apart, save
 from benchmarks.speed import status
-from torch_vdm import VDM, Haar, StationaryHaar, Steerable
-from torch_vdm.cortex import Transform
+from torch_vdm import VDM
+from torch_vdm.cli import TRANSFORMS
 from torch_vdm.io import ArrayFile
 
 THREADS = 2
@@ -27,10 +27,6 @@ QUICK_SIZES = ((300, 420),)
 
 # Up to so many pixels the whole image is computed as well, and the two maps are compared.
 LARGEST_WHOLE = 2**24
-
-TRANSFORMS: dict[str, Transform] = {
-    "fast": Haar(), "standard": StationaryHaar("filter"), "reference": Steerable(),
-}  # fmt: skip
 
 
 def run(quick: bool, output: Path | None) -> None:
@@ -84,7 +80,7 @@ def _measure(what: str, folder: Path, accuracy: str, tile: int) -> dict[str, flo
     torch.set_num_threads(THREADS)
     test, reference = (ArrayFile(folder / f"{name}.npy") for name in ("test", "reference"))
     height, width = test.shape[1:]
-    metric = VDM(transform=TRANSFORMS[accuracy])
+    metric = VDM(transform=TRANSFORMS[accuracy]())
     jnd = torch.from_file(str(folder / "map"), shared=True, size=height * width)
     jnd = jnd.view(1, height, width)
     start, cpu = time.perf_counter(), time.process_time()

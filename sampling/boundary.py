@@ -60,11 +60,8 @@ def detail_variances(leaves: Tensor, true_means: bool) -> tuple[Tensor, ...]:
             levels.append(nodes.unsqueeze(2))
             continue
         y, x = (
-            _Axis(index, *(weights.to(nodes) for weights in of_squares))
-            for index, *of_squares in (
-                _axis(side, 2 ** len(levels), nodes.shape[axis], true_means)
-                for side, axis in zip(size, (-2, -1), strict=True)
-            )
+            _axis(side, 2 ** len(levels), nodes.shape[axis], true_means, leaves.dtype)
+            for side, axis in zip(size, (-2, -1), strict=True)
         )
         upper, lower = nodes[..., y.nodes[0], :], nodes[..., y.nodes[1], :]
 
@@ -94,7 +91,7 @@ def _complete(size: tuple[int, int], node: int, nodes: Tensor, true_means: bool)
     )
 
 
-def _axis(side: int, node: int, count: int, true_means: bool) -> _Axis:
+def _axis(side: int, node: int, count: int, true_means: bool, dtype: torch.dtype) -> _Axis:
     """Return the weights along a side of ``side`` pixels in ``count`` nodes of ``node`` pixels."""
     parents = (count + 1) // 2
     nodes = torch.arange(2 * parents).view(parents, 2).T.contiguous()
@@ -117,7 +114,7 @@ def _axis(side: int, node: int, count: int, true_means: bool) -> _Axis:
     elif true_means:
         low[:, -1], high[:, -1] = squares(1.0 - half, half), squares(half, half)
         own[:, -1] = squares(1.0, real) / (1.0 + real) ** 2
-    return _Axis(nodes, low, high, own)
+    return _Axis(nodes, low.to(dtype), high.to(dtype), own.to(dtype))
 
 
 def boundaries(

@@ -72,12 +72,8 @@ class Model:
         # Nothing is known of a pixel without a finite sample, and no sample will help.
         seen = (statistics.count > 0).reshape(size)
         self.single = pooled_covariance(statistics, size) * seen
-        # Near a pixel whose samples have differed: not only those that were lucky.
-        noisy = (statistics.comoments[FIRST == SECOND] > 0.0).any(0).reshape(1, 1, *size)
-        reach = 2 * SURROUNDINGS + 1
-        self.noisy: NDArray[np.float64] = functional.max_pool2d(
-            torch.from_numpy(noisy.astype(np.float64)), reach, 1, SURROUNDINGS
-        )[0, 0].numpy()
+        # Where samples have differed.
+        self.noisy = (statistics.comoments[FIRST == SECOND] > 0.0).any(0).reshape(size)
         self.mean = torch.from_numpy(statistics.mean.reshape(1, 3, *size))
         self.true_means = metric.observer.true_means
         self.exponent = metric.observer.summation_exponent
@@ -132,8 +128,11 @@ class Model:
         image as plain and as textured as it may be. `EVEN` of all is shared by all that are noisy.
         """
         found = 0.5 * (self._slopes(self.truth) + self._slopes(self.textured))
-        even = self.noisy / max(float(self.noisy.sum()), 1.0)
-        shares: NDArray[np.float64] = (1.0 - EVEN) * found.numpy() + EVEN * even
+        noisy = torch.from_numpy(self.noisy.astype(np.float64))[None, None]
+        # And near there: not only where they were lucky.
+        even = functional.max_pool2d(noisy, 2 * SURROUNDINGS + 1, 1, SURROUNDINGS)[0, 0]
+        even = even / even.sum().clamp_min(1.0)
+        shares: NDArray[np.float64] = ((1.0 - EVEN) * found + EVEN * even).numpy()
         return shares
 
     def _slopes(self, truth: Cortex) -> Tensor:

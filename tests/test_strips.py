@@ -4,18 +4,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.ladder import TRANSFORMS
 from torch_vdm import VDM, Observer, VDMLoss, vdm
-from torch_vdm.cortex import Haar, StationaryHaar, Steerable, Transform, bands
+from torch_vdm.cortex import Transform, bands
 
 OBSERVERS = [Observer.calibrated(), Observer.paper()]
-
-TRANSFORMS: list[Transform] = [
-    Haar(),
-    StationaryHaar(),
-    Steerable(),
-    Haar("filter"),
-    StationaryHaar("filter"),
-]
 
 # Strips that divide and that do not, odd sides, an image of one strip, lines.
 SIZES = [(160, 64), (161, 83), (299, 20), (70, 131), (5, 700), (2100, 1), (1, 2100)]

@@ -8,17 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from torch_vdm import VDM, Display, Effects, Haar, ImageError, Observer, StationaryHaar, Steerable
+from tests.ladder import TRANSFORMS
+from torch_vdm import VDM, Display, Effects, ImageError, Observer
 from torch_vdm.cortex import Transform
 from torch_vdm.io import ArrayFile
 
-TRANSFORMS: list[Transform] = [
-    Haar(),
-    StationaryHaar(),
-    Steerable(),
-    Haar("filter"),
-    StationaryHaar("filter"),
-]
 OBSERVERS = [Observer.calibrated(), Observer.paper()]
 NAMES = ("test", "reference")
 each_transform = pytest.mark.parametrize("transform", TRANSFORMS, ids=repr)

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tests.conftest import KINDS, make_xyz, reference_numbers
+from tests.ladder import FILTERED, TRANSFORMS
 from tests.reference import calibrated, transforms
 from tests.reference.paper import cone_fundamentals
 from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, VDMLoss, vdm
 from torch_vdm.cortex import Transform, bands
 
 PPD = 64.0
-FILTERED: list[Transform] = [Haar("filter"), StationaryHaar("filter")]
-TRANSFORMS: list[Transform] = [Haar(), StationaryHaar(), Steerable(), *FILTERED]
 OVERLAPPING: list[Transform] = [StationaryHaar(), Steerable(), StationaryHaar("filter")]
 SIZES = [(1, 1), (1, 9), (6, 1), (8, 8), (13, 21)]
 

@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -47,10 +48,10 @@ WHITE = 100.0
 LARGEST_WHOLE = 2**24
 
 # How the image is decomposed: what accuracy costs.
-TRANSFORMS: dict[str, Transform] = {
-    "fast": Haar(),
-    "standard": StationaryHaar("filter"),
-    "reference": Steerable(),
+TRANSFORMS: dict[str, Callable[[], Transform]] = {
+    "fast": Haar,
+    "standard": partial(StationaryHaar, csf="filter"),
+    "reference": Steerable,
 }
 
 OBSERVERS = {"calibrated": Observer.calibrated, "paper": Observer.paper}
@@ -258,7 +259,7 @@ def _compare_with(room: Path, reference: Path, test: Path, options: argparse.Nam
     check_outputs((reference, test), (options.map, json_path(options)))
     ppd, seen_from = _viewing(options)
     pair = _load_pair(reference, test, options)
-    transform = TRANSFORMS[options.accuracy]
+    transform = TRANSFORMS[options.accuracy]()
     metric = VDM(ppd, pair.display, OBSERVERS[options.observer](), transform)
     tile = options.tile
     if tile is None and math.prod(pair.size) > LARGEST_WHOLE:

@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, Self
 
 import torch
@@ -367,7 +368,10 @@ class VDM(TiledMetric):
             some = slice(0, 2) if scale == 0 else slice(scale + 1, scale + 2)
             table = None if local is None else torch.cat((local[some], local[-1:]))
             weighing = passed[some].clone(), weights[:, some].clone(), table
-            contrast, here = self._contrast_at_scale(here, scale == 0, weighing, constants)
+            contrast_of = partial(
+                self._scale_contrast, finest=scale == 0, weighing=weighing, constants=constants
+            )
+            contrast, here = self._in_strips(contrast_of, here)
             seen.append(contrast)
         if coarser is not None:
             seen.append(coarser)
@@ -375,7 +379,22 @@ class VDM(TiledMetric):
             return 0.0 * planes[:, : len(constants["opponents"])]
         return bands.gathered(seen, self._fast)
 
-    def _contrast_at_scale(
+    def _in_strips(
+        self, contrast_of: Callable[[Tensor], tuple[Tensor, Tensor]], plane: Tensor
+    ) -> Sequence[Tensor]:
+        """Return `_scale_contrast` of a plane; a large one in strips, which stay in the cache."""
+        few = math.prod(_size(plane)) < 2 * BAND_STRIP
+        if few or self._fast or torch.compiler.is_compiling():
+            whole: tuple[Tensor, Tensor] = self._kept(contrast_of, plane)
+            return whole
+        tiling = Tiling.strips(_size(plane), BAND_STRIP, 0, 1, bands.REACH)
+        pieces = []
+        for strip, around in zip(tiling, tiling.split_rows(plane), strict=True):
+            found = self._kept(contrast_of, around)
+            pieces.append([cut(part, strip.within(n)) for n, part in enumerate(found, 1)])
+        return [torch.cat(parts, -2) for parts in zip(*pieces, strict=True)]
+
+    def _scale_contrast(
         self,
         plane: Tensor,
         finest: bool,
@@ -387,29 +406,6 @@ class VDM(TiledMetric):
         ``weighing``: what chromatic aberration leaves, weights, and the table of those that follow
         the luminance, all of these bands.
         """
-        few = math.prod(_size(plane)) < 2 * BAND_STRIP
-        if few or self._fast or torch.compiler.is_compiling():
-            contrast, lowpass = self._kept(
-                self._contrast_of_part, plane, finest, weighing, constants
-            )
-            return contrast, lowpass
-        # Of large planes strip by strip, which stay in the processor's cache.
-        tiling = Tiling.strips(_size(plane), BAND_STRIP, 0, 1, bands.REACH)
-        pieces = []
-        for strip, around in zip(tiling, tiling.split_rows(plane), strict=True):
-            found = self._kept(self._contrast_of_part, around, finest, weighing, constants)
-            pieces.append([cut(part, strip.within(n)) for n, part in enumerate(found, 1)])
-        contrast, lowpass = (torch.cat(parts, -2) for parts in zip(*pieces, strict=True))
-        return contrast, lowpass
-
-    def _contrast_of_part(
-        self,
-        plane: Tensor,
-        finest: bool,
-        weighing: tuple[Tensor, Tensor, Tensor | None],
-        constants: dict[str, Tensor],
-    ) -> tuple[Tensor, Tensor]:
-        """Return the same of a plane as a whole."""
         planes, around, lowpass = bands.parted(plane, finest, self._fast)
         *weights, table = weighing
         at_places = None

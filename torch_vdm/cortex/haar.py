@@ -1,6 +1,7 @@
 """The two-dimensional non-standard Haar decomposition of Eq. 2."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -127,40 +128,47 @@ def levels(
     ``planes`` (B, C, h, w) are the means of nodes of ``node`` x ``node`` pixels of an image of
     ``size`` = (H, W) pixels.
     """
-    details: list[Tensor] = []
-    lowpass: list[Tensor] = []
-    while max(planes.shape[-2:]) > 1 and len(details) < count:
-        analyse = step(_analyse, planes, fast)
-        if true_means:
-            mean_of_all, detail = analyse(complete(planes, size, node))
-            planes = own(mean_of_all, planes, size, node)
-        else:
-            planes, detail = analyse(pad_even(planes))
-        details.append(detail)
-        lowpass.append(planes)
-        node *= 2
-    return details, lowpass
+
+    def analyse(even: Tensor) -> tuple[Tensor, ...]:
+        both: tuple[Tensor, ...] = step(_analyse, even, fast)(even)
+        return both
+
+    found = _descended(planes, node, size, true_means, count, analyse)
+    return [detail for _, detail in found], [lowpass for lowpass, _ in found]
 
 
 def lowpasses(
     planes: Tensor, node: int, size: tuple[int, int], true_means: bool, count: int = DEEPEST
 ) -> list[Tensor]:
     """Return the lowpass that `levels` does, without the details."""
-    found: list[Tensor] = []
+    return [lowpass for (lowpass,) in _descended(planes, node, size, true_means, count, _means)]
+
+
+def _descended(
+    planes: Tensor,
+    node: int,
+    size: tuple[int, int],
+    true_means: bool,
+    count: int,
+    analyse: Callable[[Tensor], tuple[Tensor, ...]],
+) -> list[tuple[Tensor, ...]]:
+    """Return what ``analyse`` makes of a plane of even sides, the lowpass first, level by level."""
+    found: list[tuple[Tensor, ...]] = []
     while max(planes.shape[-2:]) > 1 and len(found) < count:
         if true_means:
-            planes = own(_means(complete(planes, size, node)), planes, size, node)
+            mean_of_all, *details = analyse(complete(planes, size, node))
+            planes = own(mean_of_all, planes, size, node)
         else:
-            planes = _means(pad_even(planes))
-        found.append(planes)
+            planes, *details = analyse(pad_even(planes))
+        found.append((planes, *details))
         node *= 2
     return found
 
 
-def _means(even: Tensor) -> Tensor:
+def _means(even: Tensor) -> tuple[Tensor]:
     """Return the lowpass of `_analyse` alone; faster than torch's own average of 2x2."""
     sums = (even[..., 0::2, :] + even[..., 1::2, :]).mul_(0.25)
-    return sums[..., 0::2] + sums[..., 1::2]
+    return (sums[..., 0::2] + sums[..., 1::2],)
 
 
 def _analyse(even: Tensor) -> tuple[Tensor, Tensor]:
