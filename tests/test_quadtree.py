@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torch_vdm import quadtree
-from torch_vdm.quadtree import pad_even, push
+from torch_vdm.quadtree import apart, pad_even, push, stacked
 
 SIZES = [(1, 1), (1, 2), (2, 1), (2, 2), (3, 5), (8, 8), (7, 12)]
 
@@ -27,6 +27,14 @@ def test_push_gives_children_their_parent(height: int, width: int) -> None:
     for y in range(height):
         for x in range(width):
             assert torch.equal(children[..., y, x], parents[..., y // 2, x // 2])
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES)
+def test_trees_below_one_another_are_pushed_each_by_itself(height: int, width: int) -> None:
+    parents = torch.rand(3, 2, -(-height // 2), -(-width // 2))
+    children = push(stacked(parents), (3 * height, width), 3)
+    assert torch.equal(children, stacked(push(parents, (height, width))))
+    assert torch.equal(apart(children[0], 3).transpose(0, 1), push(parents, (height, width)))
 
 
 def test_even_planes_are_not_copied() -> None:

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from tests.conftest import KINDS, make_xyz, reference_numbers
 from tests.reference import calibrated, paper
 from torch_vdm import VDM, Display, Effects, Observer, vdm
+from torch_vdm.cortex import Haar
+from torch_vdm.quadtree import apart, stacked
 
 PPD = 48.0
 EFFECTS = [Effects(*switches) for switches in itertools.product((True, False), repeat=4)]
@@ -163,6 +165,26 @@ def test_fast_route_answers_the_same() -> None:
     assert torch.equal(pickle.loads(pickle.dumps(fast))(*pair), fast(*pair))
 
 
+@pytest.mark.parametrize("few", [0, 40, vdm.FEW_NODES])
+@pytest.mark.parametrize("effects", [Effects(), Effects(pooling=False), Effects(chromatic=False)])
+@pytest.mark.parametrize("size", [(1, 1), (1, 6), (16, 16), (21, 34), (33, 12)])
+def test_items_below_one_another_are_seen_each_by_itself(
+    size: tuple[int, int], effects: Effects, few: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(vdm, "FEW_NODES", few)
+    metric = VDM(effects=effects)
+    batch = [image.double().requires_grad_() for image in images(3, *size)]
+    expected = metric.compare(*(metric.represent(image) for image in batch))
+    below = (
+        Haar().decompose(metric._cone_planes(stacked(image)), true_means=True, items=3)
+        for image in batch
+    )
+    actual = apart(metric.compare(*below)[0], 3).transpose(0, 1)
+    torch.testing.assert_close(actual, expected, rtol=1e-10, atol=1e-10)
+    gradients = (torch.autograd.grad(total.sum(), batch) for total in (actual, expected))
+    torch.testing.assert_close(*gradients, rtol=1e-8, atol=1e-8)
+
+
 def test_the_fast_route_is_never_compiled_again() -> None:
     # The list: any height, width and batch, after one call for each of the two ways that gradients
     # are asked for. Not slivers of over 400 to 1, of which a large level has a side of one node:
@@ -186,7 +208,8 @@ def test_the_fast_route_is_never_compiled_again() -> None:
 
 
 def test_large_images_compile_nothing_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Levels one by one and strips, of sides that are even at every level, and that are not.
+    # Levels one by one, strips and items below one another, of sides that are even at every level,
+    # and that are not.
     from torch._dynamo.utils import counters
 
     monkeypatch.setattr(vdm, "FEW_NODES", 300)
@@ -195,7 +218,8 @@ def test_large_images_compile_nothing_twice(monkeypatch: pytest.MonkeyPatch) -> 
     with torch.no_grad():
         fast(*images(1, 64, 64))
         graphs = counters["stats"]["unique_graphs"]
-        for shape in ((1, 61, 67), (1, 192, 64), (1, 203, 67), (2, 160, 80)):
+        shapes = (1, 61, 67), (1, 192, 64), (1, 203, 67), (2, 160, 80), (3, 40, 40), (5, 20, 30)
+        for shape in shapes:
             fast(*images(*shape))
             assert counters["stats"]["unique_graphs"] == graphs, shape
 

@@ -49,7 +49,7 @@ def local_visual_difference_of_energy(energy: Tensor, count: float, exponent: Te
     return (energy * rest).sum((1, 2)).unsqueeze(1) / count ** (0.5 * exponent)
 
 
-def accumulate(local: Sequence[Tensor], root: Tensor) -> Tensor:
+def accumulate(local: Sequence[Tensor], root: Tensor, items: int = 1) -> Tensor:
     """Sum the local differences down every path of the quad-tree.
 
     Parameters
@@ -58,6 +58,8 @@ def accumulate(local: Sequence[Tensor], root: Tensor) -> Tensor:
         One (B, 1, h, w) a level, level 0 (the root) first; none for an image of one pixel.
     root
         (B, 1, 1, 1), what every path begins with: the lowpass term, or 0.
+    items
+        How many trees lie below one another, root (1, 1, items, 1) and all.
 
     Returns
     -------
@@ -66,7 +68,7 @@ def accumulate(local: Sequence[Tensor], root: Tensor) -> Tensor:
     """
     total = root
     for nodes in local:
-        total = nodes + push(total, (nodes.shape[-2], nodes.shape[-1]))
+        total = nodes + push(total, (nodes.shape[-2], nodes.shape[-1]), items)
     return total
 
 

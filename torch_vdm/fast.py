@@ -15,16 +15,23 @@ SMALLEST = 4096
 # Forms of one function that are kept, by dtype, gradients and options. Status: choice.
 MOST_FORMS = 256
 
+# Share of what is computed on the way that may be kept for the backward pass; the rest is computed
+# again there. Left alone, the compiler keeps masks, which are written number by number. Status:
+# choice, measured.
+KEPT = 0.3
+
 
 @cache
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the compiled form of a pure function of tensors.
 
     It serves every height and width. A batch of one is compiled apart from larger ones, so give
-    it one item at a time, and tensors that are no views, for it is specialised on offsets too.
+    it one item at a time, or several below one another; and tensors that are no views, for it is
+    specialised on offsets too.
     """
     # Imported where it is used: it takes longer than the rest of the package.
     from torch._dynamo import config as dynamo
+    from torch._functorch import config as gradients
     from torch._inductor import config as inductor
     from torch.fx.experimental import _config as shapes
 
@@ -46,7 +53,11 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     def call(*arguments: object) -> Any:
         if torch.compiler.is_compiling():
             return function(*arguments)
-        if not shapes.use_duck_shape and dynamo.recompile_limit >= MOST_FORMS:
+        if (
+            not shapes.use_duck_shape
+            and dynamo.recompile_limit >= MOST_FORMS
+            and gradients.activation_memory_budget <= KEPT
+        ):
             return specialised(*arguments)
         with for_any_size():
             return specialised(*arguments)
@@ -56,23 +67,25 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextmanager
 def for_any_size() -> Iterator[None]:
-    """Let forms be compiled for any size, and many of them be kept.
+    """Let forms be compiled for any size, many of them be kept, and little of their numbers.
 
     Every call does so by itself; around many calls it costs less than around each.
     """
     from torch._dynamo import config as dynamo
+    from torch._functorch import config as gradients
     from torch.fx.experimental import _config as shapes
 
-    before = shapes.use_duck_shape, dynamo.recompile_limit
+    before = shapes.use_duck_shape, dynamo.recompile_limit, gradients.activation_memory_budget
     # Else two sides that are equal in the first image would be held equal for ever, and the first
     # image that is not square would compile everything again.
     shapes.use_duck_shape = False
     # For every mix of precision, gradients, display, observer and effects in one process.
     dynamo.recompile_limit = max(MOST_FORMS, dynamo.recompile_limit)
+    gradients.activation_memory_budget = min(KEPT, gradients.activation_memory_budget)
     try:
         yield
     finally:
-        shapes.use_duck_shape, dynamo.recompile_limit = before
+        shapes.use_duck_shape, dynamo.recompile_limit, gradients.activation_memory_budget = before
 
 
 def step(function: Callable[..., Any], plane: Tensor, fast: bool) -> Callable[..., Any]:

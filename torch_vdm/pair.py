@@ -65,6 +65,11 @@ class PairMetric(nn.Module):
         """Return the accumulated differences of two checked batches, (B, 1, h, w)."""
         raise NotImplementedError
 
+    def _at_once(self, size: tuple[int, int]) -> int:
+        """Return how many items of a size `_accumulated` takes at once on the fast route."""
+        del size
+        return 1
+
     def _to_pixels(self, plane: Tensor, size: tuple[int, int]) -> Tensor:
         """Return a plane of `_accumulated`, or of its root, at the pixels of the images."""
         raise NotImplementedError
@@ -131,17 +136,21 @@ class PairMetric(nn.Module):
     def _total(self, test: Tensor, reference: Tensor) -> Tensor:
         fast = self._fast and not torch.compiler.is_compiling()
         with for_any_size() if fast else nullcontext():
-            totals = [self._accumulated(one, other) for one, other in self._parts(test, reference)]
+            at_once = self._at_once((test.shape[-2], test.shape[-1]))
+            parts = self._parts(test, reference, at_once)
+            totals = [self._accumulated(one, other) for one, other in parts]
         return torch.cat(totals)
 
-    def _parts(self, test: Tensor, reference: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield both batches, whole or, on the fast route, item by item."""
+    def _parts(
+        self, test: Tensor, reference: Tensor, at_once: int = 1
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yield both batches, whole or, on the fast route, ``at_once`` items at a time."""
         if not self._fast or len(test) == 1:
             return iter([(test, reference)])
         # A compiled function is specialised on a batch of one and on the offset of a view.
         return (
             (one.clone(), other.clone())
-            for one, other in zip(test.split(1), reference.split(1), strict=True)
+            for one, other in zip(test.split(at_once), reference.split(at_once), strict=True)
         )
 
     def _checked(

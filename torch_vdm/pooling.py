@@ -3,10 +3,28 @@
 from torch import Tensor
 from torch.nn import functional
 
+from torch_vdm.quadtree import apart, together
 
-def surround(responses: Tensor) -> Tensor:
-    """Repeat the border of (B, channels, orientations, h, w) once on every side."""
-    return functional.pad(responses, (1, 1, 1, 1, 0, 0), mode="replicate")
+
+def surround(responses: Tensor, items: int = 1) -> Tensor:
+    """Repeat the border of (B, channels, orientations, h, w) once on every side.
+
+    Of each of ``items`` that lie below one another: `within` takes it off again.
+    """
+    planes = responses if items == 1 else apart(responses[0], items)
+    surrounded = functional.pad(planes, (1, 1, 1, 1, 0, 0), mode="replicate")
+    return surrounded if items == 1 else together(surrounded).unsqueeze(0)
+
+
+def within(pooled: Tensor, rows: int, items: int) -> Tensor:
+    """Return the ``rows`` of items that `surround` has made larger and `pool` has pooled as one.
+
+    From (1, 1, items (h + 2) - 2, w) to (1, 1, items h, w).
+    """
+    if items == 1 or pooled.shape[-2] == rows:
+        return pooled
+    # What lies between two items is of both of them.
+    return together(apart(functional.pad(pooled, (0, 0, 0, 2)), items)[..., :-2, :].contiguous())
 
 
 def pool(surrounded: Tensor) -> Tensor:

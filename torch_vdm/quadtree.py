@@ -82,11 +82,27 @@ def _means(plane: Tensor, axis: int, real: float) -> Tensor:
     return torch.cat((means.narrow(axis, 0, paired - 1), weighed), axis)
 
 
-def push(nodes: Tensor, size: tuple[int, int]) -> Tensor:
+def stacked(batch: Tensor) -> Tensor:
+    """Return the items of a batch (B, C, h, w) below one another, (1, C, B h, w)."""
+    return batch if len(batch) == 1 else together(batch.transpose(0, 1)).unsqueeze(0)
+
+
+def apart(planes: Tensor, items: int) -> Tensor:
+    """Return what lies below one another, (..., items h, w), as (..., items, h, w)."""
+    items_apart: Tensor = planes.unflatten(-2, (items, -1))
+    return items_apart
+
+
+def together(planes: Tensor) -> Tensor:
+    """Return (..., items, h, w) below one another, (..., items h, w): the inverse of `apart`."""
+    return planes.flatten(-3, -2)
+
+
+def push(nodes: Tensor, size: tuple[int, int], items: int = 1) -> Tensor:
     """Give every child on a plane of ``size`` = (h, w) the value of its parent.
 
     ``nodes`` is (B, C, ..., ceil(h / 2), ceil(w / 2)); the root's plane, 1 x 1, is also its own
-    parent plane.
+    parent plane. Of ``items`` trees below one another ``size`` is that of all of them.
     """
     if nodes.numel() <= SMALL and nodes.is_floating_point():
         twice = (*[1.0] * (nodes.ndim - 4), 2.0, 2.0)
@@ -97,4 +113,6 @@ def push(nodes: Tensor, size: tuple[int, int]) -> Tensor:
         children = rows.expand(*rows.shape[:-2], 2, rows.shape[-1]).flatten(-3, -2)
     if (children.shape[-2], children.shape[-1]) == size:
         return children  # no view, on which compiled code would be specialised
+    if items > 1:
+        return together(apart(children, items)[..., : size[0] // items, : size[1]].contiguous())
     return children[..., : size[0], : size[1]].contiguous()

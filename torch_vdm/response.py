@@ -96,11 +96,11 @@ class Sight(NamedTuple):
     """(B, channels, orientations, h, w): the contrast sensitivity of each channel, or one
     orientation or node of it where all have the same."""
 
-    def pushed(self, size: tuple[int, int]) -> "Sight":
+    def pushed(self, size: tuple[int, int], items: int = 1) -> "Sight":
         """Return what is given at the parents at their children, on a plane of ``size``."""
         shared = self.sensitivity.shape[-2:] == (1, 1)
-        sensitivity = self.sensitivity if shared else push(self.sensitivity, size)
-        return Sight(None if self.scale is None else push(self.scale, size), sensitivity)
+        sensitivity = self.sensitivity if shared else push(self.sensitivity, size, items)
+        return Sight(None if self.scale is None else push(self.scale, size, items), sensitivity)
 
     def of(self, orientations: slice) -> "Sight":
         """Return the sight of some orientations."""

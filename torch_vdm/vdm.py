@@ -43,8 +43,9 @@ from torch_vdm.pooling import (
     pool_halves,
     surround,
     surround_halves,
+    within,
 )
-from torch_vdm.quadtree import push
+from torch_vdm.quadtree import apart, push, stacked
 from torch_vdm.response import (
     OF_LUMINANCE,
     Level,
@@ -192,7 +193,22 @@ class VDM(TiledMetric):
             and (self._checkpointed or not graph)
         ):
             return self._accumulated_in_strips(test, reference)
-        return self.compare(self.represent(test), self.represent(reference))
+        if not self._fast or len(test) == 1:
+            return self.compare(self.represent(test), self.represent(reference))
+        # Below one another: compiled code for one image serves a batch.
+        items = len(test)
+        first, second = (
+            self._decomposed(self._cone_planes(stacked(image)), items=items)
+            for image in (test, reference)
+        )
+        return apart(self.compare(first, second)[0], items).transpose(0, 1)
+
+    def _at_once(self, size: tuple[int, int]) -> int:
+        if self.transform != Haar():
+            return 1
+        # As many pixels as are not yet cut in strips, and no more items than are few nodes, so that
+        # planes one node wide are never compiled.
+        return min(max(1, 2 * STRIP // math.prod(size)), FEW_NODES)
 
     def _accumulated_in_strips(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the same of large images, the finest levels strip by strip.
@@ -318,8 +334,10 @@ class VDM(TiledMetric):
         """
         return self._decomposed(self._cone_planes(image))
 
-    def _decomposed(self, planes: Tensor, coarser: Tensor | None = None) -> Cortex:
+    def _decomposed(self, planes: Tensor, coarser: Tensor | None = None, items: int = 1) -> Cortex:
         options = self._fast, self.observer.true_means
+        if isinstance(self.transform, Haar) and items > 1:
+            return self.transform.decompose(planes, *options, items)
         seen = self.transform.decompose(self._filtered(planes, coarser), *options)
         return seen if self.transform.csf == "levels" else seen._replace(mean=mean_of(planes))
 
@@ -479,7 +497,7 @@ class VDM(TiledMetric):
         (B, 1, h, w) of the finest level. The responses of a level are taken and dropped one
         level at a time, which bounds memory.
         """
-        return accumulate(*self._differences(first, second))
+        return accumulate(*self._differences(first, second), first.items)
 
     def _differences(self, first: Cortex, second: Cortex) -> tuple[tuple[Tensor, ...], Tensor]:
         """Return what each node adds to the map, and what every path begins with."""
@@ -509,6 +527,7 @@ class VDM(TiledMetric):
         """Return the local visual differences of the ``few`` coarsest levels, nodes in a row."""
         if few == 0:
             return []
+        items = first.items
         sizes = [_size(detail) for detail in first.details[:few]]
         nodes = [math.prod(size) for size in sizes]
         details = _in_a_row(first.details[:few]), _in_a_row(second.details[:few])
@@ -521,25 +540,29 @@ class VDM(TiledMetric):
             )
         else:
             # Both images in one batch, where nothing is computed.
+            images = first, second
             parents = _in_a_row(
-                push(torch.cat([cortex.parent_lowpass(number) for cortex in (first, second)]), size)
+                push(torch.cat([cortex.parent_lowpass(number) for cortex in images]), size, items)
                 for number, size in enumerate(sizes)
             )
             both = [parent.clone() for parent in parents.chunk(2)]
             respond = compiled(response_difference_at) if fast else response_difference_at
             seen_at = (both, level, *self._sight_options(constants))
             difference = respond(*details, seen_at, (*options, self._absolute))
-        around = [self._surrounded(plane) for plane in _planes(difference, sizes)]
+        around = [self._surrounded(plane, items) for plane in _planes(difference, sizes)]
         # Beside one another along the longer side, where the least is left to fill up.
         along = -1 if sizes[-1][0] <= sizes[-1][1] else -2
         gather = compiled(_pooled_difference) if fast else _pooled_difference
         exponent = constants["summation_exponent"]
         gathered: Tensor = gather(_joined(around, along), *self._pooling(), exponent)
         starts = itertools.accumulate((plane.shape[along] for plane in around), initial=0)
-        return [
-            gathered.narrow(along, start, size[along])[..., : size[0], : size[1]]
-            for start, size in zip(starts, sizes, strict=False)
-        ]
+        local = []
+        for start, plane, (rows, columns) in zip(starts, around, sizes, strict=False):
+            # What was put around several items is still between them.
+            long = rows if items == 1 else plane.shape[-2] - (plane.shape[-1] - columns)
+            part = gathered.narrow(along, start, (long, columns)[along])[..., :long, :columns]
+            local.append(within(part, rows, items))
+        return local
 
     def _local_difference(
         self,
@@ -551,9 +574,9 @@ class VDM(TiledMetric):
     ) -> Tensor:
         """Return the local visual difference (B, 1, h, w) of one level."""
         details, others = first.details[number], second.details[number]
-        fast = self._fast and details.numel() >= SMALLEST
+        fast, items = self._fast and details.numel() >= SMALLEST, first.items
         sight, other_sight = (
-            sight.pushed(_size(details))
+            sight.pushed(_size(details), items)
             for sight in self._sights(level, constants, (first, second), number, fast)
         )
         orientations = details.shape[2]
@@ -568,7 +591,7 @@ class VDM(TiledMetric):
 
         def gathered(one: Tensor, other: Tensor, sight: Sight, other_sight: Sight) -> Tensor:
             difference = respond(one, other, sight, other_sight, *options, self._absolute)
-            return self._gathered(difference, exponent, fast)
+            return self._gathered(difference, exponent, fast, items)
 
         # Where the gradient is known by hand, nothing needs to be kept.
         fixed = *options[:2], exponent
@@ -580,6 +603,7 @@ class VDM(TiledMetric):
             and self.transform.csf == "levels"
             and self.transform.shifts == self.transform.phases == 1
             and not fast
+            and items == 1
             and not any(constant.requires_grad for constant in fixed)
         )
         local = []
@@ -613,17 +637,20 @@ class VDM(TiledMetric):
         """Whether responses that may cancel are pooled as they are, and not as energies."""
         return self.observer.signed and self.transform.shifts == 1
 
-    def _gathered(self, difference: Tensor, exponent: Tensor, fast: bool = False) -> Tensor:
+    def _gathered(
+        self, difference: Tensor, exponent: Tensor, fast: bool = False, items: int = 1
+    ) -> Tensor:
         """Return the local visual difference of response differences, after spatial pooling."""
         gather = compiled(_pooled_difference) if fast else _pooled_difference
-        local: Tensor = gather(self._surrounded(difference, fast), *self._pooling(), exponent)
-        return local
+        surrounded = self._surrounded(difference, items, fast)
+        local: Tensor = gather(surrounded, *self._pooling(), exponent)
+        return within(local, difference.shape[-2], items)
 
-    def _surrounded(self, difference: Tensor, fast: bool = False) -> Tensor:
+    def _surrounded(self, difference: Tensor, items: int = 1, fast: bool = False) -> Tensor:
         """Return response differences with the neighbours that `_pooled_difference` takes."""
         overlapping, nodes = self._pooling()
         if not overlapping:
-            return surround(difference) if nodes > 1 else difference
+            return surround(difference, items) if nodes > 1 else difference
         energy = compiled(phase_energy) if fast else phase_energy
         rows = compiled(pool_halves) if fast else pool_halves
         surrounded = surround_halves(energy(difference, self.transform.phases), nodes)

@@ -3,14 +3,14 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import torch
 from torch import Tensor
 
 from torch_vdm.cortex.transform import CSF, DEEPEST, Base, Cortex, checked_csf, mean_of
 from torch_vdm.fast import step
-from torch_vdm.quadtree import complete, own, pad_even
+from torch_vdm.quadtree import apart, complete, own, pad_even, together
 
 # The exponent of the sum over coefficients by which a diagonal grating is made as strong as a
 # vertical one; that of the detection score. Status: choice.
@@ -47,19 +47,23 @@ class Haar:
         """Refuse what is no option."""
         checked_csf(self.csf)
 
-    def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:
+    def decompose(
+        self, planes: Tensor, fast: bool = False, true_means: bool = False, items: int = 1
+    ) -> Cortex:
         """Decompose (B, C, H, W) by Eq. 2 down to one node, by compiled steps if ``fast``.
 
         ``true_means``: a node at the border counts for the pixels that it has. Else for as many
-        as its siblings, as the repeated last row or column of an odd side makes it.
+        as its siblings, as the repeated last row or column of an odd side makes it. ``items``: so
+        many images lie below one another.
 
         Returns
         -------
         Cortex
             ``details[l]`` is (B, C, 3, h, w): d1 (horizontal), d2 (vertical), d3 (diagonal).
         """
-        size = (planes.shape[-2], planes.shape[-1])
-        return self.coarser(Base(planes, 0, size, mean_of(planes)), fast, true_means)
+        size = (planes.shape[-2] // items, planes.shape[-1])
+        base = Base(planes, 0, size, mean_of(planes, items))
+        return self.coarser(base, fast, true_means, items=items)
 
     def begin(
         self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
@@ -89,15 +93,21 @@ class Haar:
         return self.coarser(rest, fast, true_means)
 
     def coarser(
-        self, base: Base, fast: bool = False, true_means: bool = False, count: int = DEEPEST
+        self,
+        base: Base,
+        fast: bool = False,
+        true_means: bool = False,
+        count: int = DEEPEST,
+        items: int = 1,
     ) -> Cortex:
         """Return the levels of `decompose`, at most ``count``, without its ``base.octaves`` finest.
 
         The plane of ``base`` has the means of nodes of 2^octaves pixels.
         """
         plane, octaves, size, mean = base
-        details, lowpass = levels(plane, 2**octaves, size, fast, true_means, count)
-        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [plane])), mean, octaves)
+        details, lowpass = levels(plane, 2**octaves, size, fast, true_means, count, items)
+        coarsest_first = tuple(reversed(details)), tuple(reversed(lowpass or [plane]))
+        return Cortex(*coarsest_first, mean, octaves, items)
 
     def peak(self, level_from_finest: int) -> tuple[float, float]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there."""
@@ -122,18 +132,19 @@ def levels(
     fast: bool,
     true_means: bool,
     count: int = DEEPEST,
+    items: int = 1,
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Return details and lowpass of the ``count`` finest levels, the finest first.
 
     ``planes`` (B, C, h, w) are the means of nodes of ``node`` x ``node`` pixels of an image of
-    ``size`` = (H, W) pixels.
+    ``size`` = (H, W) pixels; or (1, C, items h, w) of ``items`` of them.
     """
 
     def analyse(even: Tensor) -> tuple[Tensor, ...]:
         both: tuple[Tensor, ...] = step(_analyse, even, fast)(even)
         return both
 
-    found = _descended(planes, node, size, true_means, count, analyse)
+    found = _descended(planes, node, size, true_means, count, analyse, items)
     return [detail for _, detail in found], [lowpass for lowpass, _ in found]
 
 
@@ -151,15 +162,24 @@ def _descended(
     true_means: bool,
     count: int,
     analyse: Callable[[Tensor], tuple[Tensor, ...]],
+    items: int = 1,
 ) -> list[tuple[Tensor, ...]]:
     """Return what ``analyse`` makes of a plane of even sides, the lowpass first, level by level."""
+
+    def each(function: Callable[..., Tensor], *planes: Tensor) -> Tensor:
+        """Return what a function makes of every item by itself."""
+        if items == 1:
+            return function(*planes)
+        return together(function(*(apart(plane[0], items) for plane in planes))).unsqueeze(0)
+
     found: list[tuple[Tensor, ...]] = []
-    while max(planes.shape[-2:]) > 1 and len(found) < count:
+    while max(planes.shape[-2] // items, planes.shape[-1]) > 1 and len(found) < count:
         if true_means:
-            mean_of_all, *details = analyse(complete(planes, size, node))
-            planes = own(mean_of_all, planes, size, node)
+            completed = each(partial(complete, size=size, node=node), planes)
+            mean_of_all, *details = analyse(completed)
+            planes = each(partial(own, size=size, node=node), mean_of_all, planes)
         else:
-            planes, *details = analyse(pad_even(planes))
+            planes, *details = analyse(each(pad_even, planes))
         found.append((planes, *details))
         node *= 2
     return found

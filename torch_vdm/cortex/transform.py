@@ -4,6 +4,8 @@ from typing import Literal, NamedTuple, Protocol
 
 from torch import Tensor
 
+from torch_vdm.quadtree import apart, together
+
 # Levels that constants are made for: an image of 2^24 pixels a side.
 DEEPEST = 24
 
@@ -33,12 +35,15 @@ class Cortex(NamedTuple):
         border of an odd side may count for more than it is.
     finest
         How many levels finer than these the image has; see `Transform.resume`.
+    items
+        How many images lie below one another in every plane; where there are several, B is 1.
     """
 
     details: tuple[Tensor, ...]
     lowpass: tuple[Tensor, ...]
     mean: Tensor
     finest: int = 0
+    items: int = 1
 
     def parent_lowpass(self, level: int) -> Tensor:
         """Return the lowpass one level up from ``level``; the root's is its own."""
@@ -138,10 +143,15 @@ class Transform(Protocol):
         """
 
 
-def mean_of(planes: Tensor) -> Tensor:
+def mean_of(planes: Tensor, items: int = 1) -> Tensor:
     """Return the mean of (B, C, H, W), (B, C, 1, 1), good to its last bit in any size.
+
+    Of ``items`` images below one another, (1, C, items H, W), that of each, (1, C, items, 1).
 
     The lowpass term takes the difference of two of them, 76 times and more: the rounding of a sum
     over millions of pixels would be seen.
     """
-    return planes.mean(-1, keepdim=True).double().mean(-2, keepdim=True).to(planes)
+    rows = planes.mean(-1, keepdim=True).double()
+    if items > 1:
+        return together(apart(rows, items).mean(-2, keepdim=True)).to(planes)
+    return rows.mean(-2, keepdim=True).to(planes)
