@@ -6,7 +6,7 @@ is: they place samples. *Simulation* says how large its maximum is: it stops.
 
 import math
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -42,8 +42,10 @@ SHARPNESS = 4.0
 # Status: choice, measured, of 0, 0.05, 0.1, 0.2, 0.33.
 EVEN = 0.05
 
-# Variances of itself that a single detail must have to be taken for one. Status: choice, measured.
-DOUBT = 9.0
+# Variances of itself that a single detail must have to be taken for one: where samples are placed,
+# by the image as plain as it may be, and where it is simulated, to stop. Status: choices, measured,
+# see docs/sampling.md.
+PLACING_DOUBT, STOPPING_DOUBT = 9.0, 4.0
 
 # Nodes on each side over which the simulated totals are averaged. Status: choice.
 SURROUNDINGS = 2
@@ -86,7 +88,7 @@ class Model:
         # Of the totals of the boundary images, once there are simulated ones to correct them by.
         self.correction: Tensor | None = None
         self.details = detail_variances(self.variance, self.true_means)
-        self.truth = self._estimated(_shrunk)
+        self.truth = self._estimated(partial(_shrunk, doubt=PLACING_DOUBT))
 
     def totals(self, count: NDArray[np.float64] | None = None) -> Tensor:
         """Return the total error of the finest nodes by the boundary images, (1, 1, h, w).
@@ -161,9 +163,9 @@ class Model:
     ) -> NDArray[np.float64]:
         """Return the largest difference in each of ``draws`` simulated pairs of images, JND.
 
-        The details of the truth are taken as the current ones, shrunk by the share of noise among
-        their neighbours; noise with the estimated covariance makes the image from them. In single
-        precision, for differences are known to some percent.
+        The details of the truth are taken as the current ones, shrunk by the share of noise in them
+        and among their neighbours; noise with the estimated covariance makes the image from them.
+        In single precision, for differences are known to some percent.
 
         Parameters
         ----------
@@ -182,7 +184,7 @@ class Model:
             draws = min(max(SIMULATED // (height * width), FEWEST_DRAWS), MOST_DRAWS)
         few = max(draws // 4, 2)
         step = min(max(1, AT_ONCE // (3 * height * width)), few)
-        truth = _each(self.truth, Tensor.float)
+        truth = _each(self._estimated(partial(_shrunk, doubt=STOPPING_DOUBT)), Tensor.float)
         largest = np.empty(0)
         visible = torch.zeros((), dtype=torch.float64)
         while len(largest) < draws and not (len(largest) >= few and largest.mean() > tolerance):
@@ -248,15 +250,15 @@ def _to_cones(metric: VDM) -> Tensor:
     return cones @ metric.get_buffer("primaries").double().cpu() * metric.display.gain
 
 
-def _shrunk(detail: Tensor, variance: Tensor) -> Tensor:
+def _shrunk(detail: Tensor, variance: Tensor, doubt: float) -> Tensor:
     """Return the details less the noise in them, d max(0, 1 - V / d^2), twice over.
 
     With d^2 its mean over 3x3 nodes, which finds a texture; beside an edge that mean leaves the
-    noise as it is, so the detail by itself must pass too, and pass `DOUBT` variances.
+    noise as it is, so the detail by itself must pass too, and pass ``doubt`` variances.
     """
     power = detail * detail
     share = torch.maximum(
-        _around(variance) / _around(power).clamp_min(NONE), DOUBT * variance / power.clamp_min(NONE)
+        _around(variance) / _around(power).clamp_min(NONE), doubt * variance / power.clamp_min(NONE)
     )
     return detail * (1.0 - share).clamp_min(0.0)
 
@@ -274,7 +276,7 @@ def _textured(detail: Tensor, variance: Tensor) -> Tensor:
     keep = prior / (prior + variance).clamp_min(NONE)
     likely = (keep * (keep * power + variance)).sqrt()
     return torch.where(detail < 0.0, -1.0, 1.0) * torch.maximum(
-        likely, _shrunk(detail, variance).abs()
+        likely, _shrunk(detail, variance, PLACING_DOUBT).abs()
     )
 
 

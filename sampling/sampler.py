@@ -25,7 +25,7 @@ StopReason = Literal["tolerance", "noise_threshold", "max_spp"]
 StrategyName = Literal["perceptual", "objective", "uniform", "halfbuffer"]
 
 # What `state` is made of. Raised when an older state would be continued differently.
-STATE_VERSION = 2
+STATE_VERSION = 3
 
 # Share of the tolerance that a round aims at, for a prediction is not exact. Status: choice.
 AIM = 0.98

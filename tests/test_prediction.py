@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 import torch
 
-from sampling.prediction import EVEN, MOST_DRAWS, Model, _factor, _shrunk, _textured
+from sampling.prediction import (
+    EVEN,
+    MOST_DRAWS,
+    PLACING_DOUBT,
+    Model,
+    _factor,
+    _shrunk,
+    _textured,
+)
 from sampling.renderers.synthetic import Synthetic
 from sampling.statistics import FIRST, SECOND, Statistics
 from torch_vdm import VDM, Display, Observer
@@ -42,14 +50,14 @@ def test_a_detail_is_never_enlarged_and_noise_is_taken_away() -> None:
     generator = torch.Generator().manual_seed(1)
     noise = torch.randn(1, 3, 3, 64, 64, generator=generator, dtype=torch.float64)
     one = torch.ones_like(noise)
-    shrunk = _shrunk(noise, one)
+    shrunk = _shrunk(noise, one, PLACING_DOUBT)
     assert (shrunk.abs() <= noise.abs()).all()
     assert (shrunk * noise >= 0.0).all()
     # Of pure noise next to nothing is left; of details ten times the noise nearly all.
     assert float((shrunk**2).mean()) < 0.01
     texture = 10.0 + noise
-    assert float((_shrunk(texture, one) / texture).min()) > 0.5
-    torch.testing.assert_close(_shrunk(texture, 0.0 * one), texture)
+    assert float((_shrunk(texture, one, PLACING_DOUBT) / texture).min()) > 0.5
+    torch.testing.assert_close(_shrunk(texture, 0.0 * one, PLACING_DOUBT), texture)
 
 
 def test_a_texture_in_noise_keeps_its_contrast_and_a_plain_node_beside_it_has_none() -> None:
@@ -59,7 +67,7 @@ def test_a_texture_in_noise_keeps_its_contrast_and_a_plain_node_beside_it_has_no
     texture = 2.0 * texture
     texture[..., :32] = 0.0
     seen, one = texture + noise, torch.ones_like(noise)
-    found, shrunk = _textured(seen, one), _shrunk(seen, one)
+    found, shrunk = _textured(seen, one), _shrunk(seen, one, PLACING_DOUBT)
     assert (found.abs() >= shrunk.abs()).all()
     assert (found * seen >= 0.0).all()
 
