@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from typing import Any
 
@@ -20,6 +21,9 @@ MOST_FORMS = 256
 # choice, measured.
 KEPT = 0.3
 
+# Whether `for_any_size` is in force: to ask the compiler's settings takes longer.
+_is_set: ContextVar[bool] = ContextVar("_is_set", default=False)
+
 
 @cache
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -30,10 +34,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     specialised on offsets too.
     """
     # Imported where it is used: it takes longer than the rest of the package.
-    from torch._dynamo import config as dynamo
-    from torch._functorch import config as gradients
     from torch._inductor import config as inductor
-    from torch.fx.experimental import _config as shapes
 
     specialised = torch.compile(
         function,
@@ -53,11 +54,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     def call(*arguments: object) -> Any:
         if torch.compiler.is_compiling():
             return function(*arguments)
-        if (
-            not shapes.use_duck_shape
-            and dynamo.recompile_limit >= MOST_FORMS
-            and gradients.activation_memory_budget <= KEPT
-        ):
+        if _is_set.get():
             return specialised(*arguments)
         with for_any_size():
             return specialised(*arguments)
@@ -82,9 +79,11 @@ def for_any_size() -> Iterator[None]:
     # For every mix of precision, gradients, display, observer and effects in one process.
     dynamo.recompile_limit = max(MOST_FORMS, dynamo.recompile_limit)
     gradients.activation_memory_budget = min(KEPT, gradients.activation_memory_budget)
+    token = _is_set.set(True)
     try:
         yield
     finally:
+        _is_set.reset(token)
         shapes.use_duck_shape, dynamo.recompile_limit, gradients.activation_memory_budget = before
 
 

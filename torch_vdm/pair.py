@@ -147,10 +147,11 @@ class PairMetric(nn.Module):
         """Yield both batches, whole or, on the fast route, ``at_once`` items at a time."""
         if not self._fast or len(test) == 1:
             return iter([(test, reference)])
-        # A compiled function is specialised on a batch of one and on the offset of a view.
+        parts = zip(test.split(at_once), reference.split(at_once), strict=True)
+        # Compiled code gets one item as it is, and is specialised on the offset of a view; several
+        # are put below one another, which copies them.
         return (
-            (one.clone(), other.clone())
-            for one, other in zip(test.split(at_once), reference.split(at_once), strict=True)
+            (one, other) if len(one) > 1 else (one.clone(), other.clone()) for one, other in parts
         )
 
     def _checked(
