@@ -206,9 +206,9 @@ class VDM(TiledMetric):
     def _at_once(self, size: tuple[int, int]) -> int:
         if self.transform != Haar():
             return 1
-        # As many pixels as are not yet cut in strips, and no more items than are few nodes, so that
-        # planes one node wide are never compiled.
-        return min(max(1, 2 * STRIP // math.prod(size)), FEW_NODES)
+        # As many pixels as are not yet cut in strips, and so few items that their planes of 2x2
+        # nodes are not compiled: another form would be, for a side that becomes 1.
+        return min(max(1, 2 * STRIP // math.prod(size)), SMALLEST // 16)
 
     def _accumulated_in_strips(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the same of large images, the finest levels strip by strip.
