@@ -6,6 +6,7 @@ begin with nothing. Two threads, sRGB noise in [0, 1], float32.
 """
 
 import ctypes
+import itertools
 import json
 import math
 import statistics
@@ -170,12 +171,15 @@ def _installed(maker: Callable[[], Contender]) -> bool:
     return True
 
 
-def _once(name: str, contender: Contender, test: Tensor, reference: Tensor) -> None:
+def _once(name: str, contender: Contender, test: Tensor, reference: Tensor) -> float:
+    """Return the seconds of one call."""
+    start = time.perf_counter()
     if name in FORWARD:
         with torch.no_grad():
             contender(test, reference)
     else:
         contender(test.clone().requires_grad_(), reference).backward()
+    return time.perf_counter() - start
 
 
 def _interleaved(
@@ -190,10 +194,9 @@ def _interleaved(
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     for number in range(rounds + 2):
         for name, contender in contenders.items():
-            start = time.perf_counter()
-            _once(name, contender, test, reference)
+            taken = _once(name, contender, test, reference)
             if number >= 2:  # the first rounds compile and fill caches
-                seconds[name].append(time.perf_counter() - start)
+                seconds[name].append(taken)
     return {name: statistics.median(values) for name, values in seconds.items()}
 
 
@@ -203,25 +206,21 @@ def _by_size(sizes: Sequence[tuple[int, int]], rounds: int) -> dict[str, dict[st
     A slow moment of the machine then strikes all of them. Small images are taken several times a
     round, for a moment strikes them harder.
     """
-    names = ("VDM", "VDM compiled")
-    contenders = {name: FORWARD[name]() for name in names}
+    contenders = {name: FORWARD[name]() for name in ("VDM", "VDM compiled")}
     pairs = {size: images(size) for size in sizes}
-    seconds: dict[tuple[int, int], dict[str, list[float]]] = {
-        size: {name: [] for name in names} for size in sizes
-    }
+    cells = list(itertools.product(sizes, contenders))
+    seconds: dict[tuple[tuple[int, int], str], list[float]] = {cell: [] for cell in cells}
     for number in range(rounds + 2):
-        for size, pair in pairs.items():
-            for name, contender in contenders.items():
-                for _ in range(max(1, A_ROUND // math.prod(size))):
-                    start = time.perf_counter()
-                    _once(name, contender, *pair)
-                    if number >= 2:
-                        seconds[size][name].append(time.perf_counter() - start)
+        for size, name in cells:
+            calls = range(max(1, A_ROUND // math.prod(size)))
+            taken = [_once(name, contenders[name], *pairs[size]) for _ in calls]
+            if number >= 2:  # as above
+                seconds[size, name] += taken
     return {
-        f"{width}x{height}": {
-            name: statistics.median(values) for name, values in seconds[height, width].items()
+        f"{size[1]}x{size[0]}": {
+            name: statistics.median(seconds[size, name]) for name in contenders
         }
-        for height, width in sizes
+        for size in sizes
     }
 
 
@@ -254,9 +253,7 @@ def _measure(what: str, name: str, size: tuple[int, int]) -> dict[str, float]:
     contender = CONTENDERS[name]()
     test, reference = images(size)
     if what == "first":
-        start = time.perf_counter()
-        _once(name, contender, test, reference)
-        return {"seconds": time.perf_counter() - start}
+        return {"seconds": _once(name, contender, test, reference)}
     # Imports, thread pools and compilation are not the metric's working memory.
     _once(name, contender, *images((96, 160)))
     return {"megabytes": peak_megabytes(lambda: _once(name, contender, test, reference))}

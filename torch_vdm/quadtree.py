@@ -3,7 +3,7 @@
 A plane of h x w nodes has parents on a plane of ceil(h / 2) x ceil(w / 2) nodes. The parent of
 node (x, y) is (x // 2, y // 2). A plane with an odd side is padded by repeating its last row or
 column, level by level: padding the whole image to a square power of two would cost twice the
-pixels at 1920 x 1080.
+pixels at 1920 x 1080. Several trees may lie below one another in one plane.
 """
 
 import torch
@@ -84,7 +84,7 @@ def _means(plane: Tensor, axis: int, real: float) -> Tensor:
 
 def stacked(batch: Tensor) -> Tensor:
     """Return the items of a batch (B, C, h, w) below one another, (1, C, B h, w)."""
-    return batch if len(batch) == 1 else together(batch.transpose(0, 1)).unsqueeze(0)
+    return together(batch.transpose(0, 1)).unsqueeze(0)
 
 
 def apart(planes: Tensor, items: int) -> Tensor:

@@ -195,10 +195,11 @@ class VDM(TiledMetric):
             return self._accumulated_in_strips(test, reference)
         if not self._fast or len(test) == 1:
             return self.compare(self.represent(test), self.represent(reference))
-        # Below one another: compiled code for one image serves a batch.
-        items = len(test)
+        # Below one another: compiled code for one image serves a batch. `_at_once` gives several
+        # items to this transform alone.
+        options, items = (self._fast, self.observer.true_means), len(test)
         first, second = (
-            self._decomposed(self._cone_planes(stacked(image)), items=items)
+            Haar().decompose(self._cone_planes(stacked(image)), *options, items)
             for image in (test, reference)
         )
         return apart(self.compare(first, second)[0], items).transpose(0, 1)
@@ -334,10 +335,8 @@ class VDM(TiledMetric):
         """
         return self._decomposed(self._cone_planes(image))
 
-    def _decomposed(self, planes: Tensor, coarser: Tensor | None = None, items: int = 1) -> Cortex:
+    def _decomposed(self, planes: Tensor, coarser: Tensor | None = None) -> Cortex:
         options = self._fast, self.observer.true_means
-        if isinstance(self.transform, Haar) and items > 1:
-            return self.transform.decompose(planes, *options, items)
         seen = self.transform.decompose(self._filtered(planes, coarser), *options)
         return seen if self.transform.csf == "levels" else seen._replace(mean=mean_of(planes))
 
@@ -549,7 +548,7 @@ class VDM(TiledMetric):
             respond = compiled(response_difference_at) if fast else response_difference_at
             seen_at = (both, level, *self._sight_options(constants))
             difference = respond(*details, seen_at, (*options, self._absolute))
-        around = [self._surrounded(plane, items) for plane in _planes(difference, sizes)]
+        around = [self._surrounded(plane, items=items) for plane in _planes(difference, sizes)]
         # Beside one another along the longer side, where the least is left to fill up.
         along = -1 if sizes[-1][0] <= sizes[-1][1] else -2
         gather = compiled(_pooled_difference) if fast else _pooled_difference
@@ -558,8 +557,8 @@ class VDM(TiledMetric):
         starts = itertools.accumulate((plane.shape[along] for plane in around), initial=0)
         local = []
         for start, plane, (rows, columns) in zip(starts, around, sizes, strict=False):
-            # What was put around several items is still between them.
-            long = rows if items == 1 else plane.shape[-2] - (plane.shape[-1] - columns)
+            # What was put around the items is still between them.
+            long = rows + (items - 1) * (plane.shape[-1] - columns)
             part = gathered.narrow(along, start, (long, columns)[along])[..., :long, :columns]
             local.append(within(part, rows, items))
         return local
@@ -642,11 +641,11 @@ class VDM(TiledMetric):
     ) -> Tensor:
         """Return the local visual difference of response differences, after spatial pooling."""
         gather = compiled(_pooled_difference) if fast else _pooled_difference
-        surrounded = self._surrounded(difference, items, fast)
+        surrounded = self._surrounded(difference, fast, items)
         local: Tensor = gather(surrounded, *self._pooling(), exponent)
         return within(local, difference.shape[-2], items)
 
-    def _surrounded(self, difference: Tensor, items: int = 1, fast: bool = False) -> Tensor:
+    def _surrounded(self, difference: Tensor, fast: bool = False, items: int = 1) -> Tensor:
         """Return response differences with the neighbours that `_pooled_difference` takes."""
         overlapping, nodes = self._pooling()
         if not overlapping:
