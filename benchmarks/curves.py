@@ -60,6 +60,8 @@ REFERENCE_SHARE = 0.25
 # It may take so many times as long as a run, and so many times the samples. Status: choice.
 REFERENCE_TIMES = 12.0
 
+OBSERVERS = {"paper": Observer.paper, "calibrated": Observer.calibrated}
+
 # Strategies that decide without the metric.
 NEED_NO_METRIC = ("uniform", "halfbuffer")
 
@@ -76,6 +78,8 @@ class Scene:
         Of the file, and of ``-D``.
     ppd
         Pixels per degree.
+    observer
+        Who judges, and leads perceptual sampling: "paper", or "calibrated", who leads `vdm-render`.
     tolerances
         The differences in JND to which every strategy is followed, the largest first.
     equal_spp
@@ -90,6 +94,7 @@ class Scene:
     path: Path
     parameters: dict[str, str] = dataclasses.field(default_factory=dict)
     ppd: float = 60.0
+    observer: str = "paper"
     tolerances: tuple[float, ...] = (2.0,)
     equal_spp: int | None = None
     passes: int = 0
@@ -123,8 +128,8 @@ class Run(NamedTuple):
 
 
 def metric_of(scene: Scene) -> VDM:
-    """Return the judge, and what perceptual sampling is led by: the paper's observer."""
-    return VDM(scene.ppd, Display.linear(WHITE), Observer.paper())
+    """Return the judge of a scene, by whom perceptual sampling is led too."""
+    return VDM(scene.ppd, Display.linear(WHITE), OBSERVERS[scene.observer]())
 
 
 def difference(metric: VDM, image: Plane, reference: Plane) -> Plane:
@@ -138,7 +143,7 @@ def difference(metric: VDM, image: Plane, reference: Plane) -> Plane:
 def reference_of(scene: Scene, limits: Limits, kept_only: bool = False) -> Reference | None:
     """Return the reference, rendered where it is not kept; or None with ``kept_only``."""
     renderer = MitsubaRenderer(scene.path, {**scene.parameters, **scene.converging})
-    named = [renderer.fingerprint, scene.passes, scene.ppd, limits]
+    named = [renderer.fingerprint, scene.passes, scene.ppd, scene.observer, limits]
     if not scene.passes:
         named.append(scene.tolerances)
     path = CACHE / f"reference-{_hash(named)}.npz"

@@ -15,8 +15,9 @@ from torch_vdm.quadtree import share
 # Distance of the quartiles of a normal distribution from its mean, in standard deviations.
 QUARTILE = 0.6744897501960817
 
-# A variance of nothing, in cone responses squared. Status: choice.
-NONE = 1e-200
+# A variance of nothing, in cone responses squared; in single precision it is a number too.
+# Status: choice.
+NONE = 1e-37
 
 
 class _Axis(NamedTuple):

@@ -25,7 +25,7 @@ StopReason = Literal["tolerance", "noise_threshold", "max_spp"]
 StrategyName = Literal["perceptual", "objective", "uniform", "halfbuffer"]
 
 # What `state` is made of. Raised when an older state would be continued differently.
-STATE_VERSION = 3
+STATE_VERSION = 4
 
 # Share of the tolerance that a round aims at, for a prediction is not exact. Status: choice.
 AIM = 0.98
@@ -309,7 +309,7 @@ class Sampler:
         if reason is None:
             reason = self._enough(predicted)
         if reason is None:
-            wanted = self._wanted(model, scale)
+            wanted = self._wanted(model, predicted)
             target = np.ceil(wanted).astype(np.int64).reshape(-1) + statistics.nonfinite
             target = np.maximum(target, statistics.drawn)
             forecast = int((target - statistics.drawn).sum())
@@ -359,7 +359,7 @@ class Sampler:
         seen = statistics.count.max()
         return bool(0 < seen < UNLIT and not statistics.mean.any())
 
-    def _wanted(self, model: Model, scale: float) -> Plane:
+    def _wanted(self, model: Model, predicted: float) -> Plane:
         """Return how many finite samples every pixel is to have, (H, W)."""
         threshold = self.settings.noise_threshold
         if threshold is not None:
@@ -369,7 +369,7 @@ class Sampler:
             return alone
         if self._unlit():
             return UNLIT_GROWTH * model.count
-        goal = (AIM * self.settings.tolerance / scale) ** model.exponent
+        goal = (AIM * self.settings.tolerance / predicted) ** model.exponent * model.largest()
         wanted = self._strategy.wanted(model, self._statistics, goal)
         if not (wanted > model.count).any():
             # The boundary images see nothing where the simulation does.

@@ -77,25 +77,28 @@ class Statistics:
             raise ValueError(f"expected radiance of shape ({len(pixels)}, 3), got {radiance.shape}")
         if len(pixels) == 0:
             return
-        backwards = (pixels[1:] < pixels[:-1]).any()
-        if pixels[0] < 0 or pixels[-1] >= len(self.drawn) or backwards:
-            raise ValueError(f"expected sorted pixel numbers from 0 to {len(self.drawn) - 1}")
         starts, lengths = _runs(pixels)
-        cuts = self._cuts(pixels[starts], starts, lengths)
-        ends = np.append(starts[1:], len(pixels))
+        runs = pixels[starts]
+        backwards = (runs[1:] < runs[:-1]).any()
+        if runs[0] < 0 or runs[-1] >= len(self.drawn) or backwards:
+            raise ValueError(f"expected sorted pixel numbers from 0 to {len(self.drawn) - 1}")
+        cuts = self._cuts(runs, starts, lengths)
         if len(cuts) > 0:
-            ends = np.union1d(ends, cuts)
+            starts = np.union1d(starts, cuts)
+            lengths = np.diff(starts, append=len(pixels))
         # Whole runs at a time, about as many samples as stay in the processor's cache, and never
         # two pieces of one run.
-        start = 0
-        while start < len(pixels):
-            whole = ends[np.searchsorted(ends, start, side="right") :]
-            stop = int(whole[max(int(np.searchsorted(whole, start + AT_ONCE, "right")) - 1, 0)])
+        ends = starts + lengths
+        low = 0
+        while low < len(starts):
+            start = int(starts[low])
+            high = max(int(np.searchsorted(ends, start + AT_ONCE, "right")), low + 1)
             following = int(np.searchsorted(cuts, start, side="right"))
             if following < len(cuts):
-                stop = min(stop, int(cuts[following]))
-            self._add(pixels[start:stop], radiance[start:stop])
-            start = stop
+                high = min(high, int(np.searchsorted(starts, cuts[following])))
+            some = slice(start, int(ends[high - 1]))
+            self._add(pixels[some], radiance[some], starts[low:high] - start, lengths[low:high])
+            low = high
 
     def merge(self, other: Self) -> None:
         """Fold in the statistics of other samples of the same pixels."""
@@ -151,9 +154,14 @@ class Statistics:
         cuts: NDArray[np.int64] = starts[of] + (number[of] // PIECE + place) * PIECE - number[of]
         return cuts
 
-    def _add(self, pixels: NDArray[np.int64], radiance: NDArray[np.float32]) -> None:
-        """Fold in whole runs."""
-        starts, lengths = _runs(pixels)
+    def _add(
+        self,
+        pixels: NDArray[np.int64],
+        radiance: NDArray[np.float32],
+        starts: NDArray[np.int64],
+        lengths: NDArray[np.int64],
+    ) -> None:
+        """Fold in whole runs, of which it is known where they start and how long they are."""
         runs = pixels[starts]
         # Of all numbers at once: which samples are meant is asked only where one is not finite.
         every = bool(np.isfinite(radiance).all())
@@ -226,7 +234,7 @@ class Statistics:
 def _runs(pixels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return where the runs of equal numbers start, and their lengths."""
     starts = np.concatenate(([0], np.flatnonzero(pixels[1:] != pixels[:-1]) + 1))
-    return starts, np.diff(np.append(starts, len(pixels)))
+    return starts, np.diff(starts, append=len(pixels))
 
 
 def scalar_second(comoments: Plane) -> Plane:

@@ -171,7 +171,7 @@ def _growth(model: Model, worth: Plane, goal: float) -> float:
 
     def over(growth: float) -> float:
         """Return the logarithm of the largest total over the goal."""
-        total = float(model.totals(_grown(model, worth, growth)).max())
+        total = model.largest(_grown(model, worth, growth))
         return math.log(max(total / goal, 1e-300))
 
     little, above = 0.0, over(0.0)

@@ -63,7 +63,7 @@ def plan(
 ) -> tuple[Plane, Model, float]:
     """Return what is wanted, the model, and the goal: a share of the largest total now."""
     model = Model(metric, statistics, size)
-    goal = share**model.exponent * float(model.totals().max())
+    goal = share**model.exponent * model.largest()
     return STRATEGIES[name].wanted(model, statistics, goal), model, goal
 
 
@@ -83,10 +83,10 @@ def test_nothing_is_taken_back_and_growth_is_bounded(name: str, observer: str) -
 def test_the_model_predicts_the_goal_for_what_is_wanted(name: str, observer: str) -> None:
     renderer = masking()
     wanted, model, goal = plan(name, drawn(renderer), renderer.size, METRICS[observer])
-    assert float(model.totals(wanted).max()) <= goal
+    assert model.largest(wanted) <= goal
     # And hardly any fewer would do: the last halving is 1.6 % of the growth.
     fewer = np.maximum(wanted * 0.9, model.count)
-    assert float(model.totals(fewer).max()) > goal
+    assert model.largest(fewer) > goal
 
 
 @every_strategy
@@ -215,10 +215,10 @@ def test_the_growth_is_the_smallest_that_is_enough(observer: str, share: float, 
     renderer = masking()
     model = Model(METRICS[observer], drawn(renderer), renderer.size)
     worth = np.ones(renderer.size) if even else np.random.default_rng(3).random(renderer.size)
-    goal = share * float(model.totals().max())
+    goal = share * model.largest()
 
     def enough(growth: float) -> bool:
-        return float(model.totals(_grown(model, worth, growth)).max()) <= goal
+        return model.largest(_grown(model, worth, growth)) <= goal
 
     low, high = 0.0, float(np.log(LARGEST_GROWTH))
     for _ in range(20):
@@ -230,5 +230,5 @@ def test_the_growth_is_the_smallest_that_is_enough(observer: str, share: float, 
     assert found == largest or enough(found)
     if found > max(high, smallest) + CLOSE:
         # Farther than that only where the prediction hardly moves.
-        total = float(model.totals(_grown(model, worth, found)).max())
+        total = model.largest(_grown(model, worth, found))
         assert np.log(total / goal) > -CLOSE_BELOW

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tests.conftest import KINDS, make_xyz, reference_numbers
+from tests.ladder import TRANSFORMS
 from tests.reference import calibrated, paper
 from torch_vdm import VDM, Display, Effects, Observer, vdm
-from torch_vdm.cortex import Haar
+from torch_vdm.cortex import Haar, Transform
 from torch_vdm.quadtree import apart, stacked
 
 PPD = 48.0
@@ -183,6 +184,27 @@ def test_items_below_one_another_are_seen_each_by_itself(
     torch.testing.assert_close(actual, expected, rtol=1e-10, atol=1e-10)
     gradients = (torch.autograd.grad(total.sum(), batch) for total in (actual, expected))
     torch.testing.assert_close(*gradients, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("transform", TRANSFORMS, ids=str)
+@pytest.mark.parametrize(
+    "observer", [Observer.calibrated(), Observer.paper()], ids=lambda o: o.name
+)
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (33, 34)])
+def test_many_beside_one_are_compared_as_each_with_it(
+    size: tuple[int, int], observer: Observer, transform: Transform
+) -> None:
+    metric = VDM(PPD, observer=observer, transform=transform)
+    first, others = (
+        metric.represent(image.double()) for image in (images(1, *size)[0], images(3, *size)[1])
+    )
+    same = first._replace(
+        details=tuple(plane.expand(3, *plane.shape[1:]) for plane in first.details),
+        lowpass=tuple(plane.expand(3, *plane.shape[1:]) for plane in first.lowpass),
+        mean=first.mean.expand(3, -1, -1, -1),
+    )
+    torch.testing.assert_close(metric.beside(first)(others), metric.compare(same, others))
+    assert (metric.beside(first)(first) == 0.0).all()
 
 
 def test_the_fast_route_is_never_compiled_again() -> None:

@@ -484,7 +484,8 @@ class VDM(TiledMetric):
         """
         one, other = first.mean, second.mean
         if self.observer.lowpass_gains is None:
-            return 0.0 * one[:, :1]  # of the graph, so that an image of one pixel has a gradient
+            # Of the graph, so that an image of one pixel has a gradient.
+            return 0.0 * one[:, :1] + 0.0 * other[:, :1]
         constants = self._constants(one.dtype, "dark_cones", "opponents", "lowpass_gains")
         contrast = weber_contrast(one, other, constants["dark_cones"])
         gains = constants["lowpass_gains"].view(-1, 1, 1)
@@ -497,6 +498,26 @@ class VDM(TiledMetric):
         level at a time, which bounds memory.
         """
         return accumulate(*self._differences(first, second), first.items)
+
+    def beside(self, first: Cortex) -> Callable[[Cortex], Tensor]:
+        """Return `compare` with a first representation that stays, whose responses are taken once.
+
+        It may stand for a batch of others, (1, ...) beside (B, ...). Nearly half of the time where
+        many are compared with one; in the last bits other numbers than `compare`.
+        """
+        responses = self.respond(first)
+
+        def compare(second: Cortex) -> Tensor:
+            constants = self._constants(second.mean.dtype, "summation_exponent")
+            exponent = constants["summation_exponent"]
+            root = self.lowpass_difference(first, second) ** exponent
+            local = tuple(
+                self._gathered((seen - own).abs() if self._absolute else own - seen, exponent)
+                for own, seen in zip(responses, self.respond(second), strict=True)
+            )
+            return accumulate(local, root.sum(1, keepdim=True), second.items)
+
+        return compare
 
     def _differences(self, first: Cortex, second: Cortex) -> tuple[tuple[Tensor, ...], Tensor]:
         """Return what each node adds to the map, and what every path begins with."""
