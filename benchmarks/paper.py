@@ -51,8 +51,8 @@ STRATEGIES = ("uniform", "objective", "halfbuffer", "perceptual")
 # of one core can pay for.
 SIDE, REAL_SIDE = 64, 128
 
-# Runs of each strategy on a scene.
-SEEDS = 5
+# Runs of each strategy on a scene of the paper's, and on a real one.
+SEEDS, REAL_SEEDS = 9, 5
 
 # A run ends here, reached or not. Status: choice.
 LIMITS, REAL_LIMITS = Limits(20_000.0, 25.0), Limits(20_000.0, 60.0)
@@ -211,7 +211,7 @@ def jobs(quick: bool) -> list[tuple[Scene, int, Limits]]:
     paper = [(scene, seed, LIMITS) for seed in range(1, SEEDS + 1) for scene in paper_scenes(SIDE)]
     real = [
         (scene, seed, REAL_LIMITS)
-        for seed in range(1, SEEDS + 1)
+        for seed in range(1, REAL_SEEDS + 1)
         for scene in real_scenes(REAL_SIDE)
     ]
     # A first look at everything, then real scenes, which cost little.
