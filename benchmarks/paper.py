@@ -214,7 +214,7 @@ def jobs(quick: bool) -> list[tuple[Scene, int, Limits]]:
         for seed in range(1, REAL_SEEDS + 1)
         for scene in real_scenes(REAL_SIDE)
     ]
-    # A first look at everything, then real scenes, which cost little.
+    # A first look at everything, then real scenes.
     first = len(paper_scenes(SIDE))
     return paper[:first] + real + paper[first:]
 
@@ -320,7 +320,11 @@ def _verdict(scenes: dict[str, Any]) -> list[dict[str, Any]]:
     real = [figures for figures in scenes.values() if figures["real"]]
     beside = [share(figures, "halfbuffer", "spp") for figures in four + real]
     checks.append(
-        ("all scenes, 2 JND: perceptual / half-buffer, geometric mean", _mean(beside), 0.75)
+        (
+            "all scenes, 2 JND: perceptual / half-buffer, geometric mean",
+            _mean(beside),
+            HALFBUFFER_TARGET,
+        )
     )
     for tolerance in sorted({t["tolerance"] for figures in real for t in figures["needed"]})[::-1]:
         found = _mean(

@@ -15,9 +15,9 @@ from torch_vdm.quadtree import share
 # Distance of the quartiles of a normal distribution from its mean, in standard deviations.
 QUARTILE = 0.6744897501960817
 
-# A variance of nothing, in cone responses squared; in single precision it is a number too.
-# Status: choice.
-NONE = 1e-37
+# A variance of nothing, and the largest, in cone responses squared: in single precision both are
+# numbers, and so are sums of a few of the second. Status: choice.
+NONE, LARGEST = 1e-37, 1e36
 
 
 class _Axis(NamedTuple):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from sampling.boundary import NONE, detail_variances
+from sampling.boundary import LARGEST, NONE, detail_variances
 from sampling.error import maximum, total
 from sampling.statistics import FIRST, SECOND, Statistics
 from sampling.tiles import LocalErrors, local_errors
@@ -139,7 +139,8 @@ class Model:
 
     def _estimated(self, estimate: Callable[[Tensor, Tensor], Tensor]) -> Cortex:
         """Return the image with its details as estimated from them and their variances."""
-        own = (detail.float() for detail in self.cortex.details)
+        most = math.sqrt(LARGEST)
+        own = (detail.clamp(-most, most).float() for detail in self.cortex.details)
         details = map(estimate, own, self.details)
         return self.cortex._replace(details=tuple(details))
 
@@ -269,12 +270,15 @@ class Model:
         return mean + QUANTILE * math.hypot(float(largest.std(ddof=1)), INEXACT * mean)
 
     def _cone_variance(self) -> Tensor:
-        """Return the variance of a single sample of each pixel in S, M, L, (1, 3, H, W)."""
+        """Return the variance of a single sample of each pixel in S, M, L, (1, 3, H, W).
+
+        At most `LARGEST`.
+        """
         # The diagonal of M C M^T.
         matrix = self.to_cones.numpy()
         weights = matrix[:, FIRST] * matrix[:, SECOND] * np.where(FIRST == SECOND, 1.0, 2.0)
         variance = np.einsum("ck,khw->chw", weights, self.single)
-        return torch.from_numpy(np.maximum(variance, 0.0))[None]
+        return torch.from_numpy(np.clip(variance, 0.0, LARGEST))[None]
 
 
 def _to_cones(metric: VDM) -> Tensor:

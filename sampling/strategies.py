@@ -54,8 +54,8 @@ class Strategy(Protocol):
         statistics
             The samples so far.
         goal
-            The largest total error of the boundary images that is wanted, in JND to the power of
-            the summation.
+            What is wanted to stand for the largest total error of the boundary images, in JND to
+            the power of the summation; see `Model.largest`.
         """
 
 
@@ -170,7 +170,7 @@ def _growth(model: Model, worth: Plane, goal: float) -> float:
     smallest, largest = math.log(SMALLEST_GROWTH), math.log(LARGEST_GROWTH)
 
     def over(growth: float) -> float:
-        """Return the logarithm of the largest total over the goal."""
+        """Return the logarithm of what stands for the largest total over the goal."""
         total = model.largest(_grown(model, worth, growth))
         return math.log(max(total / goal, 1e-300))
 

@@ -196,3 +196,18 @@ def test_an_image_of_no_noise_has_exactly_no_difference() -> None:
     still = Synthetic(np.full((8, 8, 3), 0.3), np.zeros((8, 8, 3)), np.ones((8, 8)))
     model = Model(VDM(60.0, Display.linear()), drawn(still, 4), still.size)
     assert model.predicted_maximum() == 0.0
+
+
+@each_observer
+@pytest.mark.parametrize("light", [1e-15, 1e15, 1e18, 1e20])
+@pytest.mark.parametrize("size", [(1, 1), (5, 7), (8, 8)])
+def test_whatever_the_light_every_figure_is_a_number(
+    size: tuple[int, int], light: float, observer: Observer
+) -> None:
+    event = light * np.random.default_rng(1).random((*size, 3))
+    renderer = Synthetic(np.full((*size, 3), 0.2), event, np.full(size, 0.5))
+    model = Model(VDM(60.0, Display.linear(), observer), drawn(renderer, 16), size)
+    assert np.isfinite(model.predicted_maximum())
+    assert np.isfinite(model.shares()).all()
+    assert torch.isfinite(model.totals()).all()
+    assert np.isfinite(model.largest())

@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from sampling import Report, Request, Sampler, Samples, Settings, rounds
+from sampling.prediction import Model
 from sampling.renderers.synthetic import Synthetic
-from sampling.sampler import UNLIT
-from sampling.statistics import PIECE
+from sampling.sampler import AIM, UNLIT
+from sampling.statistics import PIECE, Statistics
 from sampling.strategies import STRATEGIES
 from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar
 from torch_vdm.cortex import Transform
@@ -123,6 +124,29 @@ def test_long_runs_are_cut_at_fixed_numbers() -> None:
     cuts = [int(part.first[0]) for part in request.parts(1)]
     assert cuts == [first, PIECE, 2 * PIECE, 3 * PIECE]
     assert sum(part.samples for part in request.parts(1)) == count
+
+
+def test_a_round_asks_for_as_much_as_lets_the_model_predict_the_aim() -> None:
+    size, tolerance = (16, 16), 2.0
+    renderer = spotted(size=size)
+    sampler = Sampler(size, METRIC, Settings(tolerance=tolerance))
+    pilot = sampler.ask()
+    assert pilot is not None
+    samples = renderer.sample(pilot.pixels, pilot.first, pilot.count)
+    sampler.tell(samples)
+    following, report = sampler.ask(), sampler.report()
+    assert following is not None
+    assert report is not None
+    statistics = Statistics(256)
+    statistics.add(samples)
+    model = Model(METRIC, statistics, size)
+    assert model.predicted_maximum(tolerance) == report.predicted
+    wanted = sampler.count.astype(np.float64).reshape(-1)
+    wanted[following.pixels] += following.count
+    found = model.largest(wanted.reshape(size)) / model.largest()
+    goal = (AIM * tolerance / report.predicted) ** model.exponent
+    # Whole samples, and a growth that is known to some percent.
+    assert 0.95 * goal < found <= goal
 
 
 @every_strategy

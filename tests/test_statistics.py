@@ -188,3 +188,15 @@ def test_a_million_samples_cost_less_than_30_megabytes() -> None:
 def test_exceptions(pixels: list[int], shape: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match="expected"):
         Statistics(PIXELS).add(Samples(np.array(pixels), np.zeros(shape, np.float32)))
+
+
+def test_short_pieces_of_a_run_are_folded_in_one_by_one() -> None:
+    """A run of five samples, cut after two at a multiple of PIECE: both pieces of one pixel."""
+    radiance = np.random.default_rng(0).random((5, 3), np.float32)
+    statistics = Statistics(1, first=np.array([PIECE - 2]))
+    statistics.add(Samples(np.zeros(5, np.int64), radiance))
+    assert statistics.drawn[0] == 5
+    np.testing.assert_allclose(statistics.mean[:, 0], radiance.mean(0), rtol=1e-6)
+    np.testing.assert_allclose(
+        statistics.covariance()[FIRST == SECOND, 0], radiance.var(0, ddof=1), rtol=1e-5
+    )

@@ -502,8 +502,9 @@ class VDM(TiledMetric):
     def beside(self, first: Cortex) -> Callable[[Cortex], Tensor]:
         """Return `compare` with a first representation that stays, whose responses are taken once.
 
-        It may stand for a batch of others, (1, ...) beside (B, ...). Nearly half of the time where
-        many are compared with one; in the last bits other numbers than `compare`.
+        It may stand for a batch of others, (1, ...) beside (B, ...), but not for images below one
+        another. Nearly half of the time where many are compared with one; in the last bits other
+        numbers than `compare`.
         """
         responses = self.respond(first)
 
@@ -515,7 +516,7 @@ class VDM(TiledMetric):
                 self._gathered((seen - own).abs() if self._absolute else own - seen, exponent)
                 for own, seen in zip(responses, self.respond(second), strict=True)
             )
-            return accumulate(local, root.sum(1, keepdim=True), second.items)
+            return accumulate(local, root.sum(1, keepdim=True))
 
         return compare
 
