@@ -104,7 +104,15 @@ class Model:
         pixel so many samples.
         """
         with torch.no_grad():
-            return self._corrected(self.errors.at(self.leaves(count)))
+            return self._corrected(self._now if count is None else self._uncorrected(count))
+
+    @cached_property
+    def _now(self) -> Tensor:
+        """The totals for the samples so far, as the boundary images have them."""
+        return self._uncorrected(None)
+
+    def _uncorrected(self, count: NDArray[np.float64] | None) -> Tensor:
+        return _finest(self.errors.at(self.leaves(count)))
 
     def largest(self, count: NDArray[np.float64] | None = None) -> float:
         """Return what stands for the largest of the `totals` in a run, in which they scatter.
@@ -174,10 +182,9 @@ class Model:
 
     def _totals(self, variance: Tensor, truth: Cortex) -> Tensor:
         variances = detail_variances(variance, self.true_means)
-        return self._corrected(local_errors(self.metric, truth, variances, variance))
+        return self._corrected(_finest(local_errors(self.metric, truth, variances, variance)))
 
-    def _corrected(self, local: tuple[Tensor, ...]) -> Tensor:
-        finest = total(local, maximum(local))[-1].double()
+    def _corrected(self, finest: Tensor) -> Tensor:
         return finest if self.correction is None else finest * self.correction
 
     @torch.no_grad()
@@ -279,6 +286,11 @@ class Model:
         weights = matrix[:, FIRST] * matrix[:, SECOND] * np.where(FIRST == SECOND, 1.0, 2.0)
         variance = np.einsum("ck,khw->chw", weights, self.single)
         return torch.from_numpy(np.clip(variance, 0.0, LARGEST))[None]
+
+
+def _finest(local: tuple[Tensor, ...]) -> Tensor:
+    """Return the total errors of the finest nodes, (1, 1, h, w), float64."""
+    return total(local, maximum(local))[-1].double()
 
 
 def _to_cones(metric: VDM) -> Tensor:

@@ -22,7 +22,7 @@ FIRST, SECOND = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 PIECE = 2**16
 
 # Samples that are folded in at once, which bounds memory. Status: choice, measured.
-AT_ONCE = 2**15
+AT_ONCE = 2**17
 
 
 class Statistics:
@@ -86,8 +86,8 @@ class Statistics:
         if len(cuts) > 0:
             starts = np.union1d(starts, cuts)
             lengths = np.diff(starts, append=len(pixels))
-        # Whole runs at a time, about as many samples as stay in the processor's cache, and never
-        # two pieces of one run.
+        # Whole runs at a time, so many that a call costs less than its numbers, and never two
+        # pieces of one run.
         ends = starts + lengths
         low = 0
         while low < len(starts):

@@ -169,12 +169,11 @@ def _growth(model: Model, worth: Plane, goal: float) -> float:
     """
     smallest, largest = math.log(SMALLEST_GROWTH), math.log(LARGEST_GROWTH)
 
-    def over(growth: float) -> float:
+    def over(count: Plane | None) -> float:
         """Return the logarithm of what stands for the largest total over the goal."""
-        total = model.largest(_grown(model, worth, growth))
-        return math.log(max(total / goal, 1e-300))
+        return math.log(max(model.largest(count) / goal, 1e-300))
 
-    little, above = 0.0, over(0.0)
+    little, above = 0.0, over(None)
     if above <= 0.0:
         return smallest
     enough, below = largest, math.nan  # nothing is known of the largest yet
@@ -182,7 +181,7 @@ def _growth(model: Model, worth: Plane, goal: float) -> float:
     while enough - little > CLOSE:
         between, margin = enough - little, 0.0 if math.isnan(below) else 0.5 * CLOSE
         place = min(max(place, little + 0.5 * CLOSE), enough - margin)
-        found = over(place)
+        found = over(_grown(model, worth, place))
         if found > 0.0:
             falling = max((above - found) / (place - little), SLOWEST)
             little, above = place, found

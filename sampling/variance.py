@@ -42,6 +42,12 @@ CLOSE = 2.0
 # be lit. Status: choice, measured.
 BLACK = 8.0
 
+# Nodes on each side over which it is averaged what a prior is worth. Status: choice.
+REACH = 2
+
+# Nodes of a level that are computed at once. Status: choice, measured.
+AT_ONCE = 2**15
+
 # Kurtosis of normal noise, where none has been seen.
 NORMAL = 3.0
 
@@ -66,37 +72,63 @@ def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
         levels.append(_four(levels[-1]))
     estimate, mean = _own(levels.pop())
     while levels:
-        nodes = levels.pop()
-        own, own_mean = _own(nodes)
-        squares = np.concatenate((mean * mean, scalar_second(estimate[:6])[None] ** 2))
-        between = _between(np.concatenate((estimate, mean, squares)), nodes)
-        parent, parent_mean = between[:7], between[7:10]
-        # Over means of squares, and not squares of means: else a node near a lamp would have its
-        # noise but neither its light nor the kurtosis of it.
-        kurtosis = _ratio(parent[6], between[13], NORMAL)
-        freedom = 2.0 * nodes[11] / np.maximum(kurtosis - 1.0, 1e-3)
-        # A chance of p has a kurtosis of 1 / (p (1 - p)) - 3.
-        events = nodes[11] / (kurtosis + 3.0)
-        seen = scalar_second(own[:6])
-        # What is black has a rule of its own, below; its mean is believed late.
-        lit = (own[:6] != 0.0).any(0) | (own_mean != 0.0).any(0)
-        # The mean, which scales what the parents know, is shrunk by the least weight.
-        weight = PRIOR / (PRIOR + freedom)
-        doubtful = np.where(lit, events, events / BLACK)
-        weight *= _unrefuted(seen, scalar_second(parent[:6]), doubtful)
-        mean = weight * parent_mean + (1.0 - weight) * own_mean
-        chance = (1.0 - weight) ** 2 * parent[:6][FIRST == SECOND] / np.maximum(nodes[11], 1.0)
-        known = np.sqrt(between[10:13] + chance)
-        scale = np.minimum(_ratio(np.abs(mean), known, 1.0), LARGEST_SCALE)
-        covariance = parent[:6] * scale[FIRST] * scale[SECOND]
-        fourth = kurtosis * scalar_second(covariance) ** 2
-        prior = np.concatenate((covariance, fourth[None]))
-        known_second = scalar_second(prior[:6])
-        worth = _worth(seen, known_second, freedom)
-        believed = np.where(lit, _unrefuted(seen, known_second, events), _chance_of_light(freedom))
-        weight = believed * worth / (worth + freedom)
-        estimate = weight * prior + (1.0 - weight) * own
+        estimate, mean = _refined(levels.pop(), estimate, mean)
     return estimate[:6]
+
+
+def _refined(nodes: Plane, estimate: Plane, mean: Plane) -> tuple[Plane, Plane]:
+    """Return estimate and mean of the ``nodes`` of a level from those of their parents.
+
+    A few rows at a time, which stay in the processor's cache: of large planes every page would be
+    had from the system anew.
+    """
+    height, width = nodes.shape[1:]
+    rows = max(AT_ONCE // width, 1)
+    squares = np.concatenate((mean * mean, scalar_second(estimate[:6])[None] ** 2))
+    parents = np.concatenate((estimate, mean, squares))
+    finer, finer_mean = np.empty((7, height, width)), np.empty((3, height, width))
+    for top in range(0, height, rows):
+        bottom = min(top + rows, height)
+        low, high = max(top - REACH, 0), min(bottom + REACH, height)
+        found = _mixed(nodes[:, low:high], _between(parents, (low, high), width), height * width)
+        inside = slice(top - low, bottom - low)
+        finer[:, top:bottom], finer_mean[:, top:bottom] = (part[:, inside] for part in found)
+    return finer, finer_mean
+
+
+def _mixed(nodes: Plane, between: Plane, count: int) -> tuple[Plane, Plane]:
+    """Return estimate and mean of nodes, their own mixed with what lies ``between`` their parents.
+
+    ``count``: of the nodes of their level.
+    """
+    own, own_mean = _own(nodes)
+    parent, parent_mean = between[:7], between[7:10]
+    # Over means of squares, and not squares of means: else a node near a lamp would have its
+    # noise but neither its light nor the kurtosis of it.
+    kurtosis = _ratio(parent[6], between[13], NORMAL)
+    freedom = 2.0 * nodes[11] / np.maximum(kurtosis - 1.0, 1e-3)
+    # A chance of p has a kurtosis of 1 / (p (1 - p)) - 3.
+    events = nodes[11] / (kurtosis + 3.0)
+    seen = scalar_second(own[:6])
+    # What is black has a rule of its own, below; its mean is believed late.
+    lit = (own[:6] != 0.0).any(0) | (own_mean != 0.0).any(0)
+    # The mean, which scales what the parents know, is shrunk by the least weight.
+    weight = PRIOR / (PRIOR + freedom)
+    doubtful = np.where(lit, events, events / BLACK)
+    weight *= _unrefuted(seen, scalar_second(parent[:6]), doubtful, count)
+    mean = weight * parent_mean + (1.0 - weight) * own_mean
+    chance = (1.0 - weight) ** 2 * parent[:6][FIRST == SECOND] / np.maximum(nodes[11], 1.0)
+    known = np.sqrt(between[10:13] + chance)
+    scale = np.minimum(_ratio(np.abs(mean), known, 1.0), LARGEST_SCALE)
+    covariance = parent[:6] * scale[FIRST] * scale[SECOND]
+    fourth = kurtosis * scalar_second(covariance) ** 2
+    prior = np.concatenate((covariance, fourth[None]))
+    known_second = scalar_second(prior[:6])
+    worth = _worth(seen, known_second, freedom)
+    refuted = _unrefuted(seen, known_second, events, count)
+    believed = np.where(lit, refuted, _chance_of_light(freedom))
+    weight = believed * worth / (worth + freedom)
+    return weight * prior + (1.0 - weight) * own, mean
 
 
 def _worth(own: Plane, prior: Plane, freedom: Plane) -> Plane:
@@ -111,21 +143,21 @@ def _worth(own: Plane, prior: Plane, freedom: Plane) -> Plane:
     return np.clip(2.0 / np.maximum(spread, 1e-9), PRIOR, LARGEST_PRIOR)
 
 
-def _unrefuted(own: Plane, prior: Plane, events: Plane) -> Plane:
+def _unrefuted(own: Plane, prior: Plane, events: Plane, count: int) -> Plane:
     """Return how much of a prior the nodes' own variances leave, 1 to 0.
 
     Had they the prior's noise, at least ``events`` events would be expected of it. That no more
     than what was seen come of them has a chance of exp(-D) at most, D the deviance of a Poisson
-    number (Chernoff), where `CLOSE` times as many stand for what was seen; times the nodes of the
-    level, that any of them falls so low. All of the prior is left where this is 1, none where it is
-    `SIGNIFICANCE`.
+    number (Chernoff), where `CLOSE` times as many stand for what was seen; times ``count``, the
+    nodes of the level, that any of them falls so low. All of the prior is left where this is 1,
+    none where it is `SIGNIFICANCE`.
     Without it a lamp in one pixel was believed of the whole image: what was left of it by the
     weight of the nodes' own samples, next to nothing of many thousand times their noise, came down
     to the pixels with a kurtosis that none of them could refute.
     """
     share = np.minimum(CLOSE * _ratio(own, prior, 1.0), 1.0)
     entropy = share * np.log(np.where(share > 0.0, share, 1.0))
-    chance = own.size * np.exp(-events * (1.0 - share + entropy))
+    chance = count * np.exp(-events * (1.0 - share + entropy))
     left: Plane = np.clip((chance - SIGNIFICANCE) / (1.0 - SIGNIFICANCE), 0.0, 1.0)
     return left
 
@@ -146,7 +178,9 @@ def _chance_of_light(freedom: Plane) -> Plane:
 def _smooth(plane: Plane) -> Plane:
     """Return the mean over 5x5 nodes, fewer at the border."""
     tensor = torch.from_numpy(plane)[None, None]
-    return functional.avg_pool2d(tensor, 5, 1, 2, count_include_pad=False)[0, 0].numpy()
+    return functional.avg_pool2d(tensor, 2 * REACH + 1, 1, REACH, count_include_pad=False)[
+        0, 0
+    ].numpy()
 
 
 def _own(sums: Plane) -> tuple[Plane, Plane]:
@@ -173,13 +207,15 @@ def _four(plane: Plane) -> Plane:
     return total
 
 
-def _between(parents: Plane, nodes: Plane) -> Plane:
-    """Give every node what its four nearest parents have, by their distance (bilinear).
+def _between(parents: Plane, rows: tuple[int, int], width: int) -> Plane:
+    """Give nodes, from one row to another, what their four nearest parents have (bilinear).
 
     Its own parent alone would know nothing of what lies across the border of a large node: pixels
     beside that border stayed at no variance where rare light ended there.
     """
-    height, width = nodes.shape[1:]
-    tensor = torch.from_numpy(parents)[None]
+    first, last = rows
+    # A row of parents more on each side, for the ends of what is enlarged lie beyond its parents.
+    low, high = max(first // 2 - 1, 0), (last + 1) // 2 + 1
+    tensor = torch.from_numpy(parents[:, low:high])[None]
     between = functional.interpolate(tensor, scale_factor=2.0, mode="bilinear")
-    return between[0, :, :height, :width].numpy()
+    return between[0, :, first - 2 * low : last - 2 * low, :width].numpy()

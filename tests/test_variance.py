@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sampling import variance
 from sampling.renderers import Samples
 from sampling.renderers.synthetic import Synthetic
 from sampling.statistics import FIRST, SECOND, Statistics
@@ -185,14 +186,30 @@ def test_a_prior_is_dropped_only_where_chance_would_not_fall_so_far_under_it() -
     one = np.ones((16, 16))
     # Few expected events, or a variance near the prior: all of it is left.
     for own, events in ((0.0, 1.0), (0.0, 5.0), (0.5, 1e4), (1.0, 1e4), (3.0, 1e4)):
-        assert (_unrefuted(own * one, one, events * one) == 1.0).all()
+        assert (_unrefuted(own * one, one, events * one, one.size) == 1.0).all()
     # None seen of n: exp(-n), in any of 256 nodes.
     bound = np.log(one.size / SIGNIFICANCE)
-    assert (_unrefuted(0.0 * one, one, (bound - 0.1) * one) > 0.0).all()
-    assert (_unrefuted(0.0 * one, one, (bound + 0.1) * one) == 0.0).all()
+    assert (_unrefuted(0.0 * one, one, (bound - 0.1) * one, one.size) > 0.0).all()
+    assert (_unrefuted(0.0 * one, one, (bound + 0.1) * one, one.size) == 0.0).all()
     # Of nodes that are like the prior, hardly any is refuted in any image.
     rng = np.random.default_rng(11)
     for events in (4.0, 8.0, 16.0, 32.0):
         seen = rng.poisson(events, (400, 16, 16)) / events
-        dropped = [bool((_unrefuted(own, one, events * one) == 0.0).any()) for own in seen]
+        dropped = [
+            bool((_unrefuted(own, one, events * one, one.size) == 0.0).any()) for own in seen
+        ]
         assert np.mean(dropped) <= SIGNIFICANCE
+
+
+@pytest.mark.parametrize("size", [(1, 9), (7, 1), (33, 61), (40, 64)])
+@pytest.mark.parametrize("at_once", [1, 100, 700])
+def test_a_level_is_the_same_a_few_rows_at_a_time(
+    size: tuple[int, int], at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(5)
+    event = rng.random((*size, 3))
+    renderer = Synthetic(np.full((*size, 3), 0.2), event, np.full(size, 0.2))
+    statistics = drawn(renderer, 8)
+    whole = pooled_covariance(statistics, size)
+    monkeypatch.setattr(variance, "AT_ONCE", at_once)
+    np.testing.assert_allclose(pooled_covariance(statistics, size), whole, rtol=1e-9, atol=1e-15)
