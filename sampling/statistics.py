@@ -21,8 +21,9 @@ FIRST, SECOND = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 # multiple of this. So long as a run is not cut elsewhere, the batch leaves no trace in the bits.
 PIECE = 2**16
 
-# Samples that are folded in at once, which bounds memory. Status: choice, measured.
-AT_ONCE = 2**17
+# Samples, and runs of them, that are folded in at once, which bounds memory. Status: choice,
+# measured.
+AT_ONCE, RUNS_AT_ONCE = 2**17, 2**13
 
 
 class Statistics:
@@ -93,6 +94,7 @@ class Statistics:
         while low < len(starts):
             start = int(starts[low])
             high = max(int(np.searchsorted(ends, start + AT_ONCE, "right")), low + 1)
+            high = min(high, low + RUNS_AT_ONCE)
             following = int(np.searchsorted(cuts, start, side="right"))
             if following < len(cuts):
                 high = min(high, int(np.searchsorted(starts, cuts[following])))
