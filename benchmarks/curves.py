@@ -33,7 +33,8 @@ from benchmarks.places import CACHE
 from benchmarks.record import source
 from sampling import Sampler, Settings, rounds
 from sampling.renderers.mitsuba import MitsubaRenderer, load_mitsuba
-from torch_vdm import VDM, Display, Observer
+from torch_vdm import VDM, Display
+from torch_vdm.cli import OBSERVERS
 from torch_vdm.io import atomic_path
 
 Plane = NDArray[np.float64]
@@ -59,8 +60,6 @@ REFERENCE_SHARE = 0.25
 
 # It may take so many times as long as a run, and so many times the samples. Status: choice.
 REFERENCE_TIMES = 12.0
-
-OBSERVERS = {"paper": Observer.paper, "calibrated": Observer.calibrated}
 
 # Strategies that decide without the metric.
 NEED_NO_METRIC = ("uniform", "halfbuffer")

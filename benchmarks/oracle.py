@@ -12,6 +12,7 @@ import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from statistics import geometric_mean
 from typing import Any
 
 import numpy as np
@@ -175,7 +176,7 @@ def _table(result: dict[str, Any]) -> str:
     for tolerance in sorted({row["tolerance"] for row in result["rows"]})[::-1]:
         some = [row for row in result["rows"] if row["tolerance"] == tolerance]
         means = [
-            f"{math.exp(sum(math.log(row[name]) for row in some) / len(some)):.2f}"
+            f"{geometric_mean(row[name] for row in some):.2f}"
             if all(row[name] is not None for row in some)
             else ""
             for name in ("share", "found")

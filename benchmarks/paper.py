@@ -322,12 +322,12 @@ def _verdict(scenes: dict[str, Any]) -> list[dict[str, Any]]:
     checks.append(
         (
             "all scenes, 2 JND: perceptual / half-buffer, geometric mean",
-            _mean(beside),
+            statistics.geometric_mean(beside),
             HALFBUFFER_TARGET,
         )
     )
     for tolerance in sorted({t["tolerance"] for figures in real for t in figures["needed"]})[::-1]:
-        found = _mean(
+        found = statistics.geometric_mean(
             [
                 share(figures, "uniform", "spp", place)
                 for figures in real
@@ -470,11 +470,6 @@ def _known(value: float | None) -> str:
 
 def _percent(value: float, slowest: float) -> str:
     return "-" if math.isinf(slowest) else f"{100.0 * value / slowest:.1f}"
-
-
-def _mean(values: list[float]) -> float:
-    """Return the geometric mean."""
-    return math.exp(statistics.fmean(math.log(value) for value in values))
 
 
 def _median(values: list[float]) -> float:

@@ -322,7 +322,7 @@ def _textured(detail: Tensor, variance: Tensor) -> Tensor:
     less noise, all orientations together: the least, for a plain node beside an edge is no
     texture, and without the node itself, for noise is not to mask itself.
     """
-    power = (detail * detail).clamp_min(NONE)
+    power = detail * detail
     prior = _least(power - variance).clamp_min(0.0)
     keep = prior / (prior + variance).clamp_min(NONE)
     likely = (keep * (keep * power + variance)).sqrt()

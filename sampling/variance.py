@@ -178,9 +178,8 @@ def _chance_of_light(freedom: Plane) -> Plane:
 def _smooth(plane: Plane) -> Plane:
     """Return the mean over 5x5 nodes, fewer at the border."""
     tensor = torch.from_numpy(plane)[None, None]
-    return functional.avg_pool2d(tensor, 2 * REACH + 1, 1, REACH, count_include_pad=False)[
-        0, 0
-    ].numpy()
+    mean = functional.avg_pool2d(tensor, 2 * REACH + 1, 1, REACH, count_include_pad=False)
+    return mean[0, 0].numpy()
 
 
 def _own(sums: Plane) -> tuple[Plane, Plane]:
