@@ -1,16 +1,19 @@
-"""The calibrated observer, fitted to human thresholds by running the metric on their stimuli.
+"""The calibrated observer, fitted to people by running the metric on their stimuli, rung by rung.
 
-At threshold `VDM.score` is to be 1. Every stimulus is drawn and decomposed; as long as its contrast
-leaves the eye's adaptation as it is, a coefficient's weighted contrast is a number of its level,
-its channel and its luminance alone times the coefficient at a contrast of 1. `VDM.respond` gives
-that number for a coefficient of 1, and a histogram stands for the coefficients, so that a fit takes
-seconds. What comes out is judged by `VDM.score` itself, on the stimuli as light.
+At threshold the largest value of the map is to be 1. Every stimulus is drawn and decomposed; as
+long as its contrast leaves the eye's adaptation as it is, a coefficient's weighted contrast is a
+number of its level, its channel and its luminance alone times the coefficient at a contrast of 1.
+`VDM.respond` gives that number for a coefficient of 1, and the coefficients at the place where the
+map is largest stand for the stimulus, so that a fit takes seconds. The zones of a rendered picture
+in which people could not see its noise any more are fitted too, by the whole metric. What comes out
+is judged by `VDM.score` itself, on the stimuli as light.
 """
 
 import dataclasses
 import hashlib
 import math
 from collections import defaultdict
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,10 +22,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.func import functional_call, jacfwd
+from torch.nn import functional
 
 from benchmarks import record
+from benchmarks.people import PPD, PPDS, zone_scores, zones
 from benchmarks.thresholds import (
-    OFF_CENTRE,
     Threshold,
     background,
     pattern,
@@ -30,11 +34,23 @@ from benchmarks.thresholds import (
     render,
     sampling,
 )
-from torch_vdm import VDM, Display, Effects, Observer
-from torch_vdm.cortex import Cortex, Haar
-from torch_vdm.masking import signed_transducer
+from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar, Steerable
+from torch_vdm.cortex import Cortex, Transform, bands
+from torch_vdm.masking import masking_energy, signed_transducer
+from torch_vdm.pooling import covering, phase_energy, pool_halves, surround_halves
+from torch_vdm.quadtree import push
+from torch_vdm.vdm import _band_contrast, _band_sensitivity
 
 MECHANISMS = ("achromatic", "red-green", "yellow-violet", "mixed")
+
+# The rungs that are fitted, by the name that tables give them.
+RUNGS: dict[str, Transform] = {
+    "fast": Haar(),
+    "standard": StationaryHaar("filter"),
+    "reference": Steerable(),
+    "stationary": StationaryHaar(),
+    "filtered": Haar("filter"),
+}
 
 # Pixels in a cycle (its upper end) and phase of the drawings of each stimulus. Status: choice: a
 # user's display samples a cycle in any way.
@@ -69,28 +85,63 @@ HIGHEST_CONTRAST = 0.9
 # against which beliefs are weighed. Status: choice.
 MIXED_WEIGHT, OUTLIER, SPREAD = 0.3, 8.0, 3.0
 
-# How strongly the mean of a mechanism's studies is held to 0, against one row. Status: choice: less
-# lets the fit trade a mechanism's absolute sensitivity, which is what 1 JND means, for the shape of
-# another.
-ANCHOR = 100.0
+# How strongly the mean of a mechanism's studies is held to 0, and that of a picture's noise,
+# against one row. Status: choice: less of the first lets the fit trade a mechanism's absolute
+# sensitivity, which is what 1 JND means, for the shape of another; the second divides between
+# gratings and noise what no observer of these parameters has of both.
+ANCHOR, NOISE = 90.0, 150.0
 
-# Levels that are looked at, from the finest; the logarithmic bins of coefficients.
-LEVELS, BINS = 9, np.logspace(-4.5, 0.3, 121)
+# Times that the noise is computed anew with its slopes by the parameters, and their step.
+TIMES, STEP = 3, 0.1
+
+# Evaluations of a fit that begins near where it ends.
+IN_FOLDS = 10
+
+# Every so many zones are fitted; all are judged.
+ZONES = 2
+
+# Levels that are looked at, from the finest.
+LEVELS = 9
 
 DECIBELS = 20.0 / math.log(10.0)
 Array = NDArray[np.float64]
 
 
 class _Responses(nn.Module):
-    """The weighted contrast of a detail, as a module, so that its constants can be replaced."""
+    """What weights coefficients, as a module, so that its constants can be replaced."""
 
-    def __init__(self, observer: Observer, ppd: float) -> None:
+    def __init__(self, observer: Observer, ppd: float, transform: Transform) -> None:
         super().__init__()
         effects = Effects(masking=False, pooling=False)
-        self.metric = VDM(ppd, Display.xyz(), observer, effects=effects)
+        self.metric = VDM(ppd, Display.xyz(), observer, transform, effects)
 
-    def forward(self, cortex: Cortex) -> tuple[Tensor, ...]:
-        return self.metric.respond(cortex)
+    def forward(self, light: Tensor, contrast: Tensor) -> Tensor:
+        """Return the weighted contrast of a coefficient of 1, of ``contrast`` on ``light``.
+
+        Both (rows, 3). On a level, the finest first, (rows, levels, channels, gains of a level); or
+        in a band, behind a filter, (rows, bands, channels, 1), before a level's gain.
+        """
+        plane = light[:, :, None, None]
+        detail = plane * contrast[:, :, None, None]
+        if self.metric.transform.csf == "filter":
+            return self._of_bands(plane, detail)
+        each = detail.unsqueeze(2).expand(-1, -1, len(self.metric.transform.peaks(0)), -1, -1)
+        cortex = Cortex((each,) * LEVELS, (plane,) * LEVELS, plane)
+        return torch.stack([r[..., 0, 0] for r in reversed(self.metric.respond(cortex))], 1)
+
+    def _of_bands(self, plane: Tensor, detail: Tensor) -> Tensor:
+        constants = self.metric._constants(detail.dtype)
+        passed = self.metric._passed(constants["band_frequencies"], constants)
+        weights, local = self.metric._band_weights(constants)
+        assert local is not None
+        eye = constants["dark_cones"], constants["opponents"]
+        found = []
+        for band in range(LEVELS + 1):
+            some = slice(band, band + 1)
+            at_places = _band_sensitivity(plane, torch.cat((local[some], local[-1:])), constants)
+            weighing = passed[some], weights[:, some], at_places
+            found.append(_band_contrast((detail,), plane, *weighing, *eye)[..., 0])
+        return torch.stack(found, 1)
 
 
 class _View(NamedTuple):
@@ -99,11 +150,18 @@ class _View(NamedTuple):
     rows: list[int]
     """Their numbers."""
     responses: _Responses
-    cortex: Cortex
-    """A detail of their contrast on every level, on their background."""
+    light: Tensor
+    """(rows, 3): their background, S, M, L."""
+    contrast: Tensor
+    """(rows, 3): theirs."""
 
 
-def views(observer: Observer, thresholds: list[Threshold], ppds: Array) -> list[_View]:
+def views(
+    observer: Observer,
+    thresholds: list[Threshold],
+    ppds: Array,
+    transform: Transform = RUNGS["fast"],
+) -> list[_View]:
     """Group thresholds by the pixels per degree at which they are drawn."""
     groups = defaultdict(list)
     for row, ppd in enumerate(ppds):
@@ -112,61 +170,101 @@ def views(observer: Observer, thresholds: list[Threshold], ppds: Array) -> list[
     for ppd, rows in groups.items():
         light = torch.stack([background(thresholds[row].luminance) for row in rows])
         contrast = torch.stack([torch.tensor(thresholds[row].contrast).double() for row in rows])
-        detail = (light * contrast).view(-1, 3, 1, 1, 1)
-        plane = light.view(-1, 3, 1, 1)
-        cortex = Cortex((detail,) * LEVELS, (plane,) * LEVELS, plane)
-        found.append(_View(rows, _Responses(observer, ppd), cortex))
+        found.append(_View(rows, _Responses(observer, ppd, transform), light, contrast))
     return found
 
 
 def gains(of: list[_View], free: dict[str, Tensor]) -> Tensor:
-    """Return the weighted contrast of a coefficient of 1 at the thresholds' contrast.
-
-    (rows, levels, channels), the finest level first.
-    """
+    """Return what `_Responses` does at the thresholds' contrast, for all rows."""
     constants = {f"metric.{name}": value for name, value in free.items()}
     found: dict[int, Tensor] = {}
     for view in of:
-        responses = functional_call(view.responses, constants, (view.cortex,))
-        levels = torch.stack([r[:, :, 0, 0, 0] for r in reversed(responses)], 1)
-        found |= zip(view.rows, levels, strict=True)
-    return torch.stack([found[row] for row in range(len(found))]).abs()
+        weighted = functional_call(view.responses, constants, (view.light, view.contrast))
+        found |= zip(view.rows, weighted, strict=True)
+    return torch.stack([found[row] for row in range(len(found))])
 
 
-def histograms(thresholds: list[Threshold], cycle: float, phase: float, window: int) -> Array:
-    """Return how many coefficients of each size one glance at a stimulus takes in.
+class _Coefficients:
+    """The coefficients of drawn stimuli at the place where their map is largest."""
 
-    (rows, levels, bins), at a contrast of 1, weighted as `torch_vdm.pooling.glance` weighs them
-    around the middle of the stimulus.
-    """
-    known: dict[tuple[Any, ...], Array] = {}
-    rows = []
-    for threshold in thresholds:
-        ppd = sampling(threshold, cycle)
-        key = (
-            threshold.frequency,
-            threshold.area,
-            threshold.sigma,
-            threshold.stimulus,
-            threshold.orientation,
+    def __init__(self, transform: Transform, exponent: Tensor, power: float) -> None:
+        self.transform, self.exponent, self.power = transform, exponent, power
+        # What is pooled at a place lies so many nodes before and after it.
+        self.sides = (3, 2, 3, 2) if transform.shifts > 1 else (1, 1, 1, 1)
+
+    def decomposed(self, drawn: Tensor) -> list[Tensor]:
+        """Return the levels (1, bands or 1, orientations, h, w) of (H, W), the finest first."""
+        planes = drawn[None, None]
+        if self.transform.csf == "filter":
+            planes = torch.cat(_bands(planes), 1)[:, : LEVELS + 1]
+        self.cortex = self.transform.decompose(planes, true_means=True)
+        details = self.cortex.details[-LEVELS:][::-1]
+        if self.transform.csf == "levels":
+            return list(details)
+        level_gains = [[gain for _, gain in self.transform.peaks(k)] for k in range(len(details))]
+        return [
+            detail / detail.new_tensor(gain)[:, None, None]
+            for detail, gain in zip(details, level_gains, strict=True)
+        ]
+
+    def pooled(self, weighted: Tensor) -> Tensor:
+        """Return the pooled energy (B, C, orientations, h, w) of the responses to contrasts."""
+        response = signed_transducer(weighted, self.exponent, masking_energy(weighted))
+        energy = phase_energy(response, self.transform.phases)
+        if self.transform.shifts > 1:
+            around = surround_halves(energy, 3)
+            return pool_halves(pool_halves(around, 3, -1), 3, -2) / covering(3)
+        around = functional.pad(energy, (*self.sides, 0, 0), mode="replicate")
+        return functional.avg_pool3d(around, (1, 3, 3), 1)
+
+    def at_largest(self, details: list[Tensor], gain: Tensor) -> list[Tensor]:
+        """Return what the largest place of the map pools, (bands or 1, orientations, n, n) a level.
+
+        ``gain``: of one row of `gains`.
+        """
+        # As one channel: of the largest gain.
+        gain = gain.gather(
+            1, gain.abs().sum((0, 2)).argmax().view(1, 1, 1).expand(len(gain), 1, gain.shape[2])
         )
-        if key not in known:
-            known[key] = _histogram(threshold, ppd, phase, window)
-        rows.append(known[key])
-    return np.stack(rows)
+        total = torch.zeros(1, 1, 1, 1)
+        places: list[Tensor] = []
+        for level in reversed(range(len(details))):
+            detail = details[level]
+            if self.transform.csf == "filter":
+                weighted = (detail * gain[: detail.shape[1], 0, 0].view(1, -1, 1, 1, 1)).sum(
+                    1, True
+                )
+            else:
+                weighted = detail * gain[level, 0].view(1, 1, -1, 1, 1)
+            nodes = (self.pooled(weighted) ** (0.5 * self.power)).sum((1, 2)).unsqueeze(1)
+            size = (nodes.shape[-2], nodes.shape[-1])
+            before = self.cortex.grid.before(level + 1)
+            total = nodes + push(total, size, before=before)
+            here = torch.arange(nodes.numel(), dtype=nodes.dtype).view_as(nodes)
+            places = [push(place, size, before=before) for place in places] + [here]
+        leaf = int(total.argmax())
+        found = []
+        for detail, place in zip(details, reversed(places), strict=True):
+            y, x = divmod(int(place.flatten()[leaf]), detail.shape[-1])
+            around = functional.pad(detail[0], self.sides, mode="replicate")
+            side = 1 + self.sides[0] + self.sides[1]
+            found.append(around[..., y : y + side, x : x + side])
+        return found
 
 
-def _histogram(threshold: Threshold, ppd: float, phase: float, window: int) -> Array:
-    drawn = pattern(threshold, ppd, phase)
-    cortex = Haar().decompose(drawn[None, None])
-    middle = drawn.shape[-1] / 2 + OFF_CENTRE * ppd / threshold.scale
-    counts = np.zeros((LEVELS, len(BINS) - 1))
-    for level, detail in enumerate(reversed(cortex.details[-LEVELS:])):
-        nodes = torch.arange(detail.shape[-1]) + 0.5 - middle / 2.0 ** (level + 1)
-        weight = (1.0 - nodes.abs() / window).clamp_min(0.0)
-        weights = (weight[:, None] * weight).expand(detail.shape).numpy()
-        counts[level] = np.histogram(detail.abs().numpy(), BINS, weights=weights)[0]
-    return counts
+def _bands(plane: Tensor) -> list[Tensor]:
+    """Return the bands of (1, 1, H, W), the finest first, each at its size."""
+    scales: list[bands.Scale] = []
+    here = plane
+    while max(here.shape[-2:]) > 1:
+        scales.append(bands.parted(here, not scales))
+        here = scales[-1].lowpass
+    found = []
+    for number, scale in enumerate(scales):
+        for band in scale.bands:
+            finer = [torch.zeros_like(s.around) for s in scales[:number]]
+            found.append(bands.gathered([*finer, band]))
+    return found
 
 
 class Model:
@@ -177,55 +275,104 @@ class Model:
         observer: Observer,
         thresholds: list[Threshold],
         drawings: tuple[tuple[float, float], ...],
+        transform: Transform = RUNGS["fast"],
     ) -> None:
-        self.observer, self.thresholds = observer, thresholds
+        self.observer, self.thresholds, self.transform = observer, thresholds, transform
+        self.exponent = torch.tensor(observer.transducer_exponent).double()
         self.views = [
-            views(observer, thresholds, np.array([sampling(t, cycle) for t in thresholds]))
-            for cycle, _ in drawings
+            views(observer, thresholds, np.array([sampling(t, c) for t in thresholds]), transform)
+            for c, _ in drawings
         ]
-        # The sum over a histogram, as a table over the logarithm of a level's gain.
+        # The power of a level's largest response, as a table over the logarithm of its gain.
         self.start, self.step = -12.0, 0.1
-        grid = torch.arange(self.start, 14.0, self.step, dtype=torch.float64)
-        sizes = torch.tensor(np.sqrt(BINS[1:] * BINS[:-1]))
-        numbers = {k: torch.tensor(v, dtype=torch.float64) for k, v in observer.numbers().items()}
-        contrast = torch.exp(grid)[:, None] * sizes
-        response = signed_transducer(contrast[None, None, None], numbers["transducer_exponent"])
-        powers = response[0, 0, 0] ** observer.score_exponent
+        self.grid = torch.arange(self.start, 14.0, self.step, dtype=torch.float64)
+        keys = [(t.frequency, t.area, t.sigma, t.stimulus, t.orientation) for t in thresholds]
+        first = {key: row for row, key in reversed(list(enumerate(keys)))}
+        self.pattern_of = torch.tensor([list(first).index(key) for key in keys])
+        free = {name: torch.tensor(getattr(observer, name)).double() for name in FREE}
         self.tables = []
-        for cycle, phase in drawings:
-            counts = torch.tensor(histograms(thresholds, cycle, phase, observer.score_window))
-            self.tables.append(torch.log(counts @ powers.T + 1e-300))
+        for of, (cycle, phase) in zip(self.views, drawings, strict=True):
+            with torch.no_grad():
+                gain = gains(of, free)
+                rows = [
+                    self._table(thresholds[row], cycle, phase, gain[row]) for row in first.values()
+                ]
+            self.tables.append(torch.stack(rows))
 
-    def log_gains(self, free: dict[str, Tensor]) -> Tensor:
-        """Return the logarithm of `gains`, (drawings, rows, levels, channels)."""
-        each = torch.stack([gains(drawn, free) for drawn in self.views])
-        return torch.log(each.clamp_min(1e-12))
+    def _table(self, threshold: Threshold, cycle: float, phase: float, gain: Tensor) -> Tensor:
+        """Return what stands for a drawn stimulus.
 
-    def log_score(self, log_gains: Tensor) -> tuple[Tensor, Tensor]:
+        The logarithm of the power (levels, gains of a level, grid); or behind a filter, where
+        levels are made of bands, the coefficients themselves (levels, bands, orientations, n).
+        """
+        of = _Coefficients(self.transform, self.exponent, self.observer.summation_exponent)
+        details = of.decomposed(pattern(threshold, sampling(threshold, cycle), phase))
+        found = of.at_largest(details, gain)
+        if self.transform.csf == "filter":
+            whole = torch.zeros(LEVELS, LEVELS + 1, *found[0].flatten(-2).shape[1:])
+            for level, part in enumerate(found):
+                whole[level, : len(part)] = part.flatten(-2)
+            return whole.float()
+        kinds = len(self.transform.peaks(0))
+        table = torch.zeros(LEVELS, kinds, len(self.grid), dtype=torch.float64)
+        for level, part in enumerate(found):
+            contrast = torch.exp(self.grid).view(-1, 1, 1, 1) * part.flatten(-2)
+            power = self._power(contrast.unsqueeze(-2)).squeeze(1)
+            table[level] = (power.sum(1, keepdim=True) if kinds == 1 else power).T
+        return torch.log(table + 1e-300)
+
+    def _power(self, contrast: Tensor) -> Tensor:
+        """Return the power (..., orientations) of contrasts (B, ., orientations, 1, nodes)."""
+        response = signed_transducer(contrast, self.exponent, masking_energy(contrast))
+        energy = phase_energy(response, self.transform.phases)
+        return energy.mean((-2, -1)) ** (0.5 * self.observer.summation_exponent)
+
+    def log_score(self, gain: list[Tensor], times: Tensor) -> tuple[Tensor, Tensor]:
         """Return the logarithm of the score, mean over the drawings, and its slope; (rows,)."""
-        place = ((log_gains - self.start) / self.step).clamp(0.0, self.tables[0].shape[-1] - 1.001)
+        of = self._filtered_score if self.transform.csf == "filter" else self._level_score
+        found = [of(g, table, times) for g, table in zip(gain, self.tables, strict=True)]
+        score, slope = (torch.stack(part).mean(0) for part in zip(*found, strict=True))
+        return score / self.observer.summation_exponent, slope / self.observer.summation_exponent
+
+    def _level_score(self, gain: Tensor, table: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+        logs = torch.log(gain.abs().clamp_min(1e-12)) + times.view(-1, 1, 1, 1)
+        table = table[self.pattern_of]
+        place = ((logs.transpose(2, 3) - self.start) / self.step).clamp(
+            0.0, table.shape[-1] - 1.001
+        )
         low = place.detach().floor().long()
-        scores, slopes = [], []
-        for at, between, table in zip(low, place, self.tables, strict=True):
-            below = table.gather(-1, at)
-            rise = table.gather(-1, at + 1) - below
-            terms = (below + rise * (between - at)).flatten(1)
-            total = torch.logsumexp(terms, -1)
-            scores.append(total - math.log(self.observer.score_coefficients))
-            slopes.append((torch.softmax(terms, -1) * rise.flatten(1) / self.step).sum(-1))
-        exponent = self.observer.score_exponent
-        return torch.stack(scores).mean(0) / exponent, torch.stack(slopes).mean(0) / exponent
+        below = table.gather(-1, low)
+        rise = table.gather(-1, low + 1) - below
+        terms = (below + rise * (place - low)).flatten(1)
+        slope = (torch.softmax(terms, -1) * rise.flatten(1) / self.step).sum(-1)
+        return torch.logsumexp(terms, -1), slope.detach()
+
+    def _filtered_score(self, gain: Tensor, table: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+        weights = (gain[..., 0] * torch.exp(times).view(-1, 1, 1)).to(table)
+        contrast = torch.einsum("rlbon,rbc->rclon", table[self.pattern_of], weights)
+        half = 0.5 * self.observer.summation_exponent
+        mask = (contrast * contrast).sum(3, keepdim=True)
+        exponent = self.exponent.to(table)
+        response = signed_transducer(contrast, exponent, mask)
+        # Of the logarithm of a response by that of the contrast.
+        rise = 1.0 - 2.0 * exponent * mask / (1.0 + mask)
+        energy = (response * response).mean(-1)
+        by_times = 2.0 * (response * response * rise).mean(-1)
+        total = (energy**half).sum((1, 2, 3)).double().clamp_min(1e-300)
+        slope = (half * energy ** (half - 1.0) * by_times).sum((1, 2, 3)).double() / total
+        return torch.log(total), slope.detach()
 
     def residual(self, free: dict[str, Tensor]) -> Tensor:
         """Return predicted over human threshold in dB, (rows,)."""
-        log_gains = self.log_gains(free)
+        gain = [gains(of, free) for of in self.views]
+        fixed = [g.detach() for g in gain]
         times = torch.zeros(len(self.thresholds), dtype=torch.float64)
         # Newton on the logarithm of contrast; the last step carries the derivative.
         for _ in range(8):
-            score, slope = self.log_score(log_gains.detach() + times.view(-1, 1, 1))
-            times = (times - score / slope.clamp_min(0.1)).clamp(-8.0, 8.0)
-        score, slope = self.log_score(log_gains + times.view(-1, 1, 1))
-        return (times - score / slope.detach().clamp_min(0.1)) * DECIBELS
+            score, slope = self.log_score(fixed, times)
+            times = (times - (score / slope.clamp_min(0.1)).detach()).clamp(-8.0, 8.0)
+        score, slope = self.log_score(gain, times)
+        return (times - score / slope.clamp_min(0.1)) * DECIBELS
 
 
 class FormulaModel:
@@ -241,7 +388,7 @@ class FormulaModel:
 
     def residual(self, free: dict[str, Tensor]) -> Tensor:
         """Return predicted over human threshold in dB, (rows,)."""
-        finest = gains(self.views, free)[:, 0]
+        finest = gains(self.views, free)[:, 0, :, 0].abs()
         seen = (finest**self.EXPONENT).sum(-1) ** (1.0 / self.EXPONENT)
         return -torch.log(seen) * DECIBELS
 
@@ -277,15 +424,22 @@ def robust(residual: Tensor) -> Tensor:
     return residual * torch.sqrt(2.0 / (1.0 + torch.sqrt(1.0 + (residual / OUTLIER) ** 2)))
 
 
+# The mean of the noise of a picture by logarithms of the parameters, dB over what people just see.
+Noise = Callable[[Array], float]
+
+
 def fit(
     model: Model | FormulaModel,
     start: dict[str, float],
     evaluations: int = 25,
     spread: float = SPREAD,
+    noise: Noise | None = None,
+    times: int = TIMES,
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return the fitted parameters and the standard deviation of their logarithms.
 
-    ``spread`` is the rms of the data in dB: how much the beliefs of `FREE` weigh against it.
+    ``spread`` is the rms of the data in dB: how much the beliefs of `FREE` weigh against it. The
+    noise is computed anew, with its slopes, so many ``times``.
     """
     from scipy.optimize import least_squares
 
@@ -304,32 +458,53 @@ def fit(
     centre = torch.tensor([math.log(FREE[name][0]) for name in names])
     width = torch.tensor([FREE[name][1] for name in names]).double()
 
-    def terms(logs: Tensor) -> Tensor:
+    def terms(logs: Tensor, about: Tensor, seen: float, rises: Tensor) -> Tensor:
         free = {name: torch.exp(value) for name, value in zip(names, logs, strict=True)}
         residual = model.residual(free)
         means = mean_of.T @ residual
         within = robust(residual - share @ means) * weight
         held = ANCHOR**0.5 * (anchors @ means) / anchors.sum(1)
-        return torch.cat((within, held, spread * (logs - centre) / width))
+        noisy = NOISE**0.5 * (seen + (rises * (logs - about)).sum())
+        return torch.cat((within, held, noisy[None], spread * (logs - centre) / width))
 
-    def evaluate(logs: Array) -> Array:
-        with torch.no_grad():
-            return np.asarray(terms(torch.tensor(logs)))
+    logs = np.log([start[name] for name in names])
+    for _ in range(1 if noise is None else times):
+        seen, rises = 0.0, np.zeros(len(names))
+        if noise is not None:
+            seen = noise(logs)
+            rises = (
+                np.array([noise(logs + step) - seen for step in STEP * np.eye(len(names))]) / STEP
+            )
+        around = torch.tensor(logs), seen, torch.tensor(rises)
 
-    def slopes(logs: Array) -> Array:
-        return np.asarray(jacfwd(terms)(torch.tensor(logs)).detach())
+        def evaluate(logs: Array, around: Any = around) -> Array:
+            with torch.no_grad():
+                return np.asarray(terms(torch.tensor(logs), *around))
 
-    found = least_squares(
-        evaluate,
-        np.log([start[name] for name in names]),
-        jac=slopes,
-        max_nfev=evaluations,
-        xtol=1e-4,
-        ftol=1e-5,
-    )
+        def slopes(logs: Array, around: Any = around) -> Array:
+            return np.asarray(jacfwd(terms)(torch.tensor(logs), *around).detach())
+
+        found = least_squares(
+            evaluate, logs, jac=slopes, max_nfev=evaluations, xtol=1e-4, ftol=1e-5
+        )
+        logs = found.x
     covariance = np.linalg.inv(found.jac.T @ found.jac) * np.mean(found.fun**2)
     values = {name: float(np.exp(value)) for name, value in zip(names, found.x, strict=True)}
     return values, dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+
+
+def noise_of(observer: Observer, transform: Transform, every: int = ZONES) -> Noise | None:
+    """Return the `Noise` of SIN3D's zones; None where the data is not there."""
+    some = zones()[::every]
+    if not some:
+        return None
+
+    def noise(logs: Array) -> float:
+        changed: Any = dict(zip(FREE, np.exp(logs).tolist(), strict=True))
+        scores = zone_scores(dataclasses.replace(observer, **changed), transform, PPD, some)
+        return float(np.mean(DECIBELS * np.log(scores)))
+
+    return noise
 
 
 def predicted(model: Model | FormulaModel, values: dict[str, float]) -> Array:
@@ -353,14 +528,18 @@ def studies(thresholds: list[Threshold]) -> NDArray[np.int64]:
 
 
 def left_out(
-    make: Any, thresholds: list[Threshold], folds: NDArray[np.int64], start: dict[str, float]
+    make: Any,
+    thresholds: list[Threshold],
+    folds: NDArray[np.int64],
+    start: dict[str, float],
+    noise: Noise | None = None,
 ) -> dict[str, float]:
     """Return the rms of rows that the fit did not see, one gain a study and mechanism."""
     residual = np.full(len(thresholds), np.nan)
     for fold in sorted(set(folds.tolist()) - {-1}):
         inside = [t for t, f in zip(thresholds, folds, strict=True) if f != fold]
         outside = [t for t, f in zip(thresholds, folds, strict=True) if f == fold]
-        values, _ = fit(make(inside), start)
+        values, _ = fit(make(inside), start, IN_FOLDS, noise=noise, times=1)
         residual[folds == fold] = predicted(make(outside), values)
     seen = folds >= 0
     some = [t for t, s in zip(thresholds, seen, strict=True) if s]
@@ -397,14 +576,16 @@ def whole_metric(
     return np.array(residual)
 
 
-def masking(observer: Observer, pedestals: tuple[float, ...]) -> dict[str, Any]:
+def masking(
+    observer: Observer, transform: Transform, pedestals: tuple[float, ...]
+) -> dict[str, Any]:
     """Return how a Gabor patch is hidden by its own pedestal, both in dB over its threshold.
 
     2 cycles/degree, 50 cd/m2; by `VDM.score` and bisection. The slope is that of the last two.
     """
     patch = Threshold(0, "", "", "", 2.0, 3.14, 0.5, 50.0, (0.01,) * 3, "gabor", 0.0)
     ppd = 32.0
-    drawn, metric = pattern(patch, ppd, 0.4), VDM(ppd, Display.xyz(), observer)
+    drawn, metric = pattern(patch, ppd, 0.4), VDM(ppd, Display.xyz(), observer, transform)
 
     def increment(pedestal: float) -> float:
         below = render(patch, drawn, pedestal)
@@ -430,35 +611,65 @@ def masking(observer: Observer, pedestals: tuple[float, ...]) -> dict[str, Any]:
 def run(quick: bool, output: Path | None) -> None:
     torch.set_default_dtype(torch.float64)
     try:
-        result = {**record.circumstances(), **calibrate(quick)}
+        result = record.circumstances()
+        # What is done is kept.
+        for found in calibrate(quick):
+            result |= found
+            if output is not None:
+                record.save(output, "calibrate", result, table(result))
     finally:
         torch.set_default_dtype(torch.float32)
-    text = table(result)
-    print(text)
-    if output is not None:
-        record.save(output, "calibrate", result, text)
+    print(table(result))
 
 
-def calibrate(quick: bool) -> dict[str, Any]:
+def calibrate(quick: bool) -> Iterator[dict[str, Any]]:
+    """Yield what is found, rung by rung."""
     rows = read_thresholds()
     bright = [max(map(abs, t.contrast)) > HIGHEST_CONTRAST for t in rows]
     discs = [t for t, b in zip(rows, bright, strict=True) if t.stimulus == "disk" and not b]
     used = [t for t, b in zip(rows, bright, strict=True) if t.stimulus != "disk" and not b]
     if quick:
         used, discs = used[::8], discs[::5]
-    observer = Observer.calibrated()
-    drawings = DRAWINGS[:1] if quick else DRAWINGS
-    start = {name: value for name, (value, _) in FREE.items()}
+    found: dict[str, Any] = {
+        "excluded_rows": [t.row for t, b in zip(rows, bright, strict=True) if b],
+        "noise_is_fitted": bool(zones()) and not quick,
+        "rungs": {},
+    }
+    for name, transform in RUNGS.items():
+        if not (quick and name in ("reference", "stationary", "filtered")):
+            found["rungs"][name] = rung(transform, used, discs, quick)
+            yield found
+    if not quick:
+        # The curves alone, of the rung that has the paper's transform.
+        observer, start = Observer.calibrated(), {n: value for n, (value, _) in FREE.items()}
+
+        def formula(some: list[Threshold]) -> FormulaModel:
+            return FormulaModel(observer, some)
+
+        values, _ = fit(formula(used), start)
+        residual = predicted(formula(used), values)
+        found["formula_in_sample"] = by_mechanism(centred(residual, used), used)
+        found["formula_leave_one_study_out"] = left_out(formula, used, studies(used), start)
+        yield found
+
+
+def rung(
+    transform: Transform, used: list[Threshold], discs: list[Threshold], quick: bool
+) -> dict[str, Any]:
+    """Return what the fit of one rung gives."""
+    observer = Observer.calibrated().fitted_to(transform)
+    # Behind a filter a drawing costs ten times as much.
+    drawings = DRAWINGS[:1] if quick or transform.csf == "filter" else DRAWINGS
+    start = {name: getattr(observer, name) for name in FREE}
 
     def drawn(some: list[Threshold]) -> Model:
-        return Model(observer, some, drawings[:1])
+        return Model(observer, some, DRAWINGS[:1], transform)
 
-    def formula(some: list[Threshold]) -> FormulaModel:
-        return FormulaModel(observer, some)
-
-    values, deviations = fit(Model(observer, used, drawings), start, 6 if quick else 50)
-    residual = predicted(Model(observer, used, drawings), values)
-    discs_residual = predicted(Model(observer, discs, drawings), values)
+    noise = None if quick else noise_of(observer, transform)
+    model = Model(observer, used, drawings, transform)
+    values, deviations = fit(model, start, 6 if quick else 30, noise=noise)
+    residual = predicted(model, values)
+    discs_residual = predicted(Model(observer, discs, drawings, transform), values)
     numbers: dict[str, Any] = {**values}
     fitted = dataclasses.replace(observer, **numbers)
     result: dict[str, Any] = {
@@ -468,28 +679,36 @@ def calibrate(quick: bool) -> dict[str, Any]:
         },
         "in_sample": by_mechanism(centred(residual, used), used),
         "without_gains": by_mechanism(residual, used),
+        "without_gains_together": float(np.sqrt(np.mean(residual**2))),
         "discs": by_mechanism(discs_residual, discs),
         "discs_with_gains": by_mechanism(centred(discs_residual, discs), discs),
-        "excluded_rows": [t.row for t, b in zip(rows, bright, strict=True) if b],
         "gains": study_gains(residual, used),
     }
     if not quick:
-        one, _ = fit(drawn(used), values)
+        # The noise rises with the parameters as it does where all is fitted.
+        noise = None if noise is None else _straight(noise, np.log(list(values.values())))
+        one, _ = fit(drawn(used), values, IN_FOLDS, noise=noise, times=1)
         result["one_drawing"] = by_mechanism(centred(predicted(drawn(used), one), used), used)
-        result["five_folds"] = left_out(drawn, used, five_folds(used), values)
-        result["leave_one_study_out"] = left_out(drawn, used, studies(used), start)
-        formula_values, _ = fit(formula(used), start)
-        result["formula_in_sample"] = by_mechanism(
-            centred(predicted(formula(used), formula_values), used), used
-        )
-        result["formula_leave_one_study_out"] = left_out(formula, used, studies(used), start)
+        folds = five_folds(used), studies(used)
+        result["five_folds"] = left_out(drawn, used, folds[0], values, noise)
+        result["leave_one_study_out"] = left_out(drawn, used, folds[1], values, noise)
+        result["zones"] = {
+            str(ppd): zone_scores(fitted, transform, ppd, zones()).tolist() for ppd in PPDS
+        }
     pedestals = (0.0, 24.0, 30.0) if quick else (-12.0, -6.0, -3.0, 0.0, 3.0, 6.0, 12.0, 24.0, 30.0)
-    result["masking"] = masking(fitted, pedestals)
-    every = 16 if quick else 1
+    result["masking"] = masking(fitted, transform, pedestals)
+    every = 16 if quick else 4
     some = used[::every]
-    whole = whole_metric(fitted, some, residual[::every], *DRAWINGS[0])
+    whole = whole_metric(fitted, some, residual[::every], *DRAWINGS[0], transform=transform)
     result["whole_metric"] = by_mechanism(centred(whole, some), some)
     return result
+
+
+def _straight(noise: Noise, about: Array) -> Noise:
+    """Return a noise that rises in a straight line, as it does at some parameters."""
+    seen = noise(about)
+    rises = np.array([noise(about + step) - seen for step in STEP * np.eye(len(about))]) / STEP
+    return lambda logs: float(seen + rises @ (logs - about))
 
 
 def study_gains(residual: Array, thresholds: list[Threshold]) -> dict[str, float]:
@@ -503,32 +722,48 @@ ROWS = {
     "one_drawing": "in sample, one drawing of each stimulus",
     "five_folds": "five folds, one drawing",
     "leave_one_study_out": "one study left out, one drawing",
-    "formula_in_sample": "the curves alone, in sample",
-    "formula_leave_one_study_out": "the curves alone, one study left out",
-    "whole_metric": "`VDM.score` on rendered light, in sample",
+    "whole_metric": "`VDM.score` on rendered light, in sample, every fourth",
     "without_gains": "in sample, without gains of studies",
     "discs": "discs, not fitted, without gains",
     "discs_with_gains": "discs, not fitted",
+}
+FORMULA_ROWS = {
+    "formula_in_sample": "the curves alone, in sample",
+    "formula_leave_one_study_out": "the curves alone, one study left out",
 }
 
 
 def table(result: dict[str, Any]) -> str:
     lines = [
-        "# The calibrated observer, fitted to human thresholds",
+        "# The calibrated observer, fitted to people, for each transform",
         "",
         record.caption(result),
         "",
-        "Predicted over human contrast threshold; one gain a study and mechanism unless stated.",
+        "Predicted over human contrast threshold, rms in dB; one gain a study and mechanism unless "
+        "stated. " + ("With" if result["noise_is_fitted"] else "Without") + " the noise of SIN3D's "
+        f"zones in the fit. Left out for their contrast: rows "
+        f"{', '.join(map(str, result['excluded_rows']))}.",
         "",
-        "| rms, dB | " + " | ".join(MECHANISMS) + " |",
-        "|---|" + "---|" * len(MECHANISMS),
+        "| | | " + " | ".join(MECHANISMS) + " |",
+        "|---|---|" + "---|" * len(MECHANISMS),
     ]
-    for key, name in ROWS.items():
-        if key in result:
-            cells = [f"{result[key][m]:.2f}" if m in result[key] else "" for m in MECHANISMS]
-            lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    hidden = result["masking"]
-    lines += [
+    for name, found in result["rungs"].items():
+        lines += [_row(name, title, found[key]) for key, title in ROWS.items() if key in found]
+    lines += [_row("", t, result[key]) for key, t in FORMULA_ROWS.items() if key in result]
+    for name, found in result["rungs"].items():
+        lines += ["", f"## {name}: `{RUNGS[name]!r}`", "", *_of_rung(found)]
+    return "\n".join(lines) + "\n"
+
+
+def _row(rung: str, title: str, rms: dict[str, float]) -> str:
+    cells = [f"{rms[m]:.2f}" if m in rms else "" for m in MECHANISMS]
+    return f"| {rung} | {title} | " + " | ".join(cells) + " |"
+
+
+def _of_rung(found: dict[str, Any]) -> list[str]:
+    hidden = found["masking"]
+    lines = [
+        f"All mechanisms together, without gains: {found['without_gains_together']:.2f} dB.",
         "",
         "A Gabor patch on its own pedestal: far above threshold its increment rises with a slope "
         f"of {hidden['slope']:.2f}; at its lowest it is {hidden['lowest_db']:+.1f} dB. In dB over "
@@ -540,12 +775,23 @@ def table(result: dict[str, Any]) -> str:
         + ".",
         "",
         "Mean over threshold in dB: "
-        + "; ".join(f"{name} {gain:+.1f}" for name, gain in result["gains"].items())
-        + f". Left out for their contrast: rows {', '.join(map(str, result['excluded_rows']))}.",
+        + "; ".join(f"{name} {gain:+.1f}" for name, gain in found["gains"].items())
+        + ".",
     ]
+    if "zones" in found:
+        lines += [
+            "",
+            "| SIN3D's zones, pixels per degree | geometric mean, JND | octaves |",
+            "|---|---|---|",
+        ]
+        for ppd, scores in found["zones"].items():
+            octaves = np.log2(scores)
+            lines.append(
+                f"| {float(ppd):.0f} | {2.0 ** octaves.mean():.2f} | {octaves.std():.2f} |"
+            )
     lines += ["", "| parameter | value | within a factor of |", "|---|---|---|"]
     lines += [
-        f"| {name} | {found['value']:.4g} | {found['times_or_over']:.2f} |"
-        for name, found in result["parameters"].items()
+        f"| {name} | {of['value']:.4g} | {of['times_or_over']:.2f} |"
+        for name, of in found["parameters"].items()
     ]
-    return "\n".join(lines) + "\n"
+    return lines

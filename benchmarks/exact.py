@@ -81,26 +81,21 @@ def _exact(
         -((frequency / mpf(observer.aberration_cutoff)) ** mpf(observer.aberration_exponent))
     )
     sensitivities = [value / gain for value in _sensitivities(observer, frequency, luminance)]
-    total = mpf(0)
-    for orientation in range(3):
-        responses = []
-        for planes in details:
+    responses = []
+    for planes in details:
+        # Channels, of all orientations each.
+        weighted: list[list[Any]] = [[], [], []]
+        for orientation in range(3):
             contrasts = [
                 mpf(planes[k][orientation]) * (short if k == 0 else 1) / adapted[k]
                 for k in range(3)
             ]
-            opponents = [
-                sum(mpf(weight) * contrast for weight, contrast in zip(row, contrasts, strict=True))
-                for row in SML_TO_OPPONENTS
-            ]
-            responses.append(
-                [
-                    _transduced(observer, sensitivity * opponent)
-                    for sensitivity, opponent in zip(sensitivities, opponents, strict=True)
-                ]
-            )
-        exponent = mpf(observer.summation_exponent)
-        total += sum(abs(one - other) ** exponent for one, other in zip(*responses, strict=True))
+            for channel, row in enumerate(SML_TO_OPPONENTS):
+                mixed = sum(mpf(w) * contrast for w, contrast in zip(row, contrasts, strict=True))
+                weighted[channel].append(sensitivities[channel] * mixed)
+        responses.append([_transduced(observer, v, of) for of in weighted for v in of])
+    exponent = mpf(observer.summation_exponent)
+    total = sum(abs(one - other) ** exponent for one, other in zip(*responses, strict=True))
     # One node: its 3x3 mean is itself.
     return total ** (1 / mpf(observer.summation_exponent))
 
@@ -133,10 +128,10 @@ def _sensitivities(observer: Observer, frequency: Any, luminance: Any) -> list[A
     return [achromatic, *(value * dark ** -o["chromatic_dimming"] for value in chromatic)]
 
 
-def _transduced(observer: Observer, weighted: Any) -> Any:
-    """Return the response to a weighted contrast, 1 at threshold."""
+def _transduced(observer: Observer, weighted: Any, masks: list[Any]) -> Any:
+    """Return the response to a weighted contrast, 1 at threshold, beside all that mask it."""
     if observer.signed:
         q = mpf(observer.transducer_exponent)
-        return 2**q * weighted * (1 + weighted**2) ** -q
+        return 2**q * weighted * (1 + sum(v**2 for v in masks)) ** -q
     energy = weighted**2
     return 2 * energy ** mpf("1.125") / (energy ** mpf("1.025") + 1)

@@ -3,14 +3,15 @@
 "Refine error estimate" and "construct boundary images" of Fig. 8.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.cortex import Cortex
-from torch_vdm.quadtree import share
+from torch_vdm.cortex import Cortex, Haar
+from torch_vdm.grid import Side
 
 # Distance of the quartiles of a normal distribution from its mean, in standard deviations.
 QUARTILE = 0.6744897501960817
@@ -31,6 +32,21 @@ class _Axis(NamedTuple):
     """(2, n), in its difference."""
     own: Tensor
     """(2, n), in the mean of the parent's own pixels."""
+
+    @property
+    def ends(self) -> "_Axis":
+        """The same of the first and the last parent."""
+        return _Axis(*(part[:, [0, -1]] for part in self))
+
+    @property
+    def within(self) -> "_Axis":
+        """The same of all others."""
+        return _Axis(*(part[:, 1:-1] for part in self))
+
+    @property
+    def inner(self) -> slice:
+        """The nodes of these."""
+        return slice(int(self.nodes[0, 1]), int(self.nodes[1, -2]) + 1)
 
 
 def detail_variances(leaves: Tensor, true_means: bool) -> tuple[Tensor, ...]:
@@ -53,68 +69,100 @@ def detail_variances(leaves: Tensor, true_means: bool) -> tuple[Tensor, ...]:
         (B, C, 1, h, w) where all three have the same.
     """
     size = (leaves.shape[-2], leaves.shape[-1])
+    grid = Haar().grid(size, true_means)
     levels: list[Tensor] = []
     nodes = leaves
     while max(nodes.shape[-2:]) > 1:
-        if _complete(size, 2 ** len(levels), nodes, true_means):
+        counts = nodes.shape[-2], nodes.shape[-1]
+        # As printed, a node with fewer pixels counts for as many as its siblings.
+        sides = grid.sides(size, len(levels)) if true_means else (Side(0, 1.0, 1.0),) * 2
+        if all(map(_complete, sides, counts)):
             nodes = functional.avg_pool2d(nodes, 2) * 0.25
             levels.append(nodes.unsqueeze(2))
             continue
         y, x = (
-            _axis(side, 2 ** len(levels), nodes.shape[axis], true_means, leaves.dtype)
-            for side, axis in zip(size, (-2, -1), strict=True)
+            _axis(side, count, true_means, leaves.dtype)
+            for side, count in zip(sides, counts, strict=True)
         )
-        upper, lower = nodes[..., y.nodes[0], :], nodes[..., y.nodes[1], :]
-
-        def across(
-            weights: Tensor, upper: Tensor = upper, lower: Tensor = lower, x: _Axis = x
-        ) -> tuple[Tensor, Tensor]:
-            rows = weights[0, :, None] * upper + weights[1, :, None] * lower
-            return rows[..., x.nodes[0]], rows[..., x.nodes[1]]
-
-        (left, right), (left_high, right_high) = across(y.low), across(y.high)
-        details = (
-            x.high[0] * left + x.high[1] * right,
-            x.low[0] * left_high + x.low[1] * right_high,
-            x.high[0] * left_high + x.high[1] * right_high,
-        )
-        levels.append(torch.stack(details, 2))
-        left, right = across(y.own)
-        nodes = x.own[0] * left + x.own[1] * right
+        parents = y.nodes.shape[1], x.nodes.shape[1]
+        # Where a border is all that differs, which it always is on the grid of thirds.
+        weighed = _bordered if true_means and min(parents) > 2 else _weighed
+        details, nodes = weighed(nodes, y, x)
+        levels.append(details)
     return tuple(reversed(levels))
 
 
-def _complete(size: tuple[int, int], node: int, nodes: Tensor, true_means: bool) -> bool:
-    """Return whether all parents of nodes of ``node`` pixels have four, of all their pixels."""
-    return all(
-        nodes.shape[axis] % 2 == 0 and not (true_means and share(side, node) < 1.0)
-        for side, axis in zip(size, (-2, -1), strict=True)
+def _weighed(nodes: Tensor, y: _Axis, x: _Axis) -> tuple[Tensor, Tensor]:
+    """Return the variances of the details (B, C, 3, h, w) and of the means (B, C, h, w)."""
+    upper, lower = nodes[..., y.nodes[0], :], nodes[..., y.nodes[1], :]
+
+    def across(weights: Tensor) -> tuple[Tensor, Tensor]:
+        rows = weights[0, :, None] * upper + weights[1, :, None] * lower
+        return rows[..., x.nodes[0]], rows[..., x.nodes[1]]
+
+    (left, right), (left_high, right_high) = across(y.low), across(y.high)
+    details = (
+        x.high[0] * left + x.high[1] * right,
+        x.low[0] * left_high + x.low[1] * right_high,
+        x.high[0] * left_high + x.high[1] * right_high,
     )
+    left, right = across(y.own)
+    return torch.stack(details, 2), x.own[0] * left + x.own[1] * right
 
 
-def _axis(side: int, node: int, count: int, true_means: bool, dtype: torch.dtype) -> _Axis:
-    """Return the weights along a side of ``side`` pixels in ``count`` nodes of ``node`` pixels."""
-    parents = (count + 1) // 2
-    nodes = torch.arange(2 * parents).view(parents, 2).T.contiguous()
+def _bordered(nodes: Tensor, y: _Axis, x: _Axis) -> tuple[Tensor, Tensor]:
+    """Return the same where all but the first and last parents are of four whole nodes."""
+    inner = functional.avg_pool2d(nodes[..., y.inner, x.inner], 2) * 0.25
+    rows = _weighed(nodes, y.ends, x)
+    # Of the columns no more than it takes.
+    sides = x.ends._replace(nodes=torch.arange(4).view(2, 2))
+    columns = _weighed(nodes[..., x.ends.nodes.flatten()], y.within, sides)
+
+    def framed(inner: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
+        middle = torch.cat((columns[..., :1], inner, columns[..., 1:]), -1)
+        return torch.cat((rows[..., :1, :], middle, rows[..., 1:, :]), -2)
+
+    of_details = inner.unsqueeze(2).expand(-1, -1, 3, -1, -1)
+    return framed(of_details, columns[0], rows[0]), framed(inner, columns[1], rows[1])
+
+
+def _complete(side: Side, count: int) -> bool:
+    """Return whether all parents along a side have two of ``count`` nodes, of all their pixels."""
+    return side == Side(0, 1.0, 1.0) and count % 2 == 0
+
+
+@lru_cache(maxsize=128)
+def _axis(side: Side, count: int, true_means: bool, dtype: torch.dtype) -> _Axis:
+    """Return the weights along a side of ``count`` nodes."""
+    parents = (count + side.before + 1) // 2
+    nodes = (torch.arange(2 * parents).view(parents, 2) - side.before).T.contiguous()
     low = torch.full((2, parents), 0.25, dtype=torch.float64)
     high, own = low.clone(), low.clone()
-    real = share(side, node)
 
     def squares(first: float, second: float) -> Tensor:
         return torch.tensor([first**2, second**2], dtype=torch.float64)
 
-    # The pixels that the last node lacks are like the node before it; without a sibling its window
-    # reaches back over that one, or it stands beside itself.
-    half = 0.5 * real
-    if count % 2 == 1:
-        nodes[:, -1] = torch.tensor([count - 1, max(count - 2, 0)])
-        own[:, -1] = squares(1.0, 0.0)
-        reaches = true_means and count > 1
-        low[:, -1] = squares(half, 1.0 - half) if reaches else squares(1.0, 0.0)
-        high[:, -1] = squares(half, half) if reaches else 0.0
-    elif true_means:
-        low[:, -1], high[:, -1] = squares(1.0 - half, half), squares(half, half)
-        own[:, -1] = squares(1.0, real) / (1.0 + real) ** 2
+    # Parent, its border node and the one beside that, the pixels it has, whether it is alone.
+    first = 0, (0, 1), side.first, side.before == 1
+    last = parents - 1, (count - 1, count - 2), side.last, (count + side.before) % 2 == 1
+    for parent, pair, real, alone in (first, last):
+        if real == 1.0 and not alone:
+            continue
+        nodes[:, parent] = torch.tensor(pair).clamp_min(0)
+        if alone and (count == 1 or not true_means):
+            # It stands beside itself.
+            low[:, parent] = own[:, parent] = squares(1.0, 0.0)
+            high[:, parent] = 0.0
+            continue
+        # The pixels that it lacks are like the node beside it, over which its window reaches back.
+        half = 0.5 * real
+        low[:, parent], high[:, parent] = squares(half, 1.0 - half), squares(half, half)
+        own[:, parent] = squares(1.0, 0.0) if alone else squares(real, 1.0) / (1.0 + real) ** 2
+    if count == 2 and side.before == 0:
+        both, half = side.first + side.last, 0.5 * min(side.first, side.last)
+        nodes = torch.tensor([[0], [1]])
+        low[:, 0] = own[:, 0] = squares(side.first, side.last) / both**2
+        high[:, 0] = squares(half, half)
     return _Axis(nodes, low.to(dtype), high.to(dtype), own.to(dtype))
 
 

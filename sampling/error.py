@@ -1,7 +1,7 @@
 """The trees of local, maximum and total error.
 
 "Local visual difference prediction" and "update maximum error tree" of Fig. 8. The local errors
-come from `VDM.local_differences`, in JND to the power of the summation, 2.4.
+come from `VDM.local_differences`, in JND to the power of the summation.
 """
 
 from collections.abc import Sequence
@@ -10,16 +10,19 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torch_vdm.grid import Grid
 from torch_vdm.quadtree import push
 
 
-def maximum(local: Sequence[Tensor]) -> tuple[Tensor, ...]:
+def maximum(local: Sequence[Tensor], grid: Grid) -> tuple[Tensor, ...]:
     """Return for each node its local error plus the largest maximum among its children.
 
     Parameters
     ----------
     local
-        One (B, 1, h, w) a level, level 0 (the root) first.
+        One (B, 1, h, w) a level, level 0 (the root) first; not negative.
+    grid
+        Where the nodes lie.
 
     Returns
     -------
@@ -27,13 +30,14 @@ def maximum(local: Sequence[Tensor]) -> tuple[Tensor, ...]:
         The same shapes. Level 0: the largest error along any path of the tree.
     """
     levels = [local[-1]]
-    for nodes in reversed(local[:-1]):
-        below = functional.max_pool2d(levels[-1], 2, ceil_mode=True)
-        levels.append(nodes + below)
+    for octave, nodes in enumerate(reversed(local[:-1]), 1):
+        top, left = grid.before(octave)
+        children = functional.pad(levels[-1], (left, 0, top, 0)) if top or left else levels[-1]
+        levels.append(nodes + functional.max_pool2d(children, 2, ceil_mode=True))
     return tuple(reversed(levels))
 
 
-def total(local: Sequence[Tensor], largest: Sequence[Tensor]) -> tuple[Tensor, ...]:
+def total(local: Sequence[Tensor], largest: Sequence[Tensor], grid: Grid) -> tuple[Tensor, ...]:
     """Return for each node the local errors on the path to it plus its maximum error.
 
     Parameters
@@ -42,6 +46,8 @@ def total(local: Sequence[Tensor], largest: Sequence[Tensor]) -> tuple[Tensor, .
         One (B, 1, h, w) a level, level 0 first.
     largest
         What `maximum` gives for it.
+    grid
+        Where the nodes lie.
 
     Returns
     -------
@@ -51,9 +57,9 @@ def total(local: Sequence[Tensor], largest: Sequence[Tensor]) -> tuple[Tensor, .
     """
     levels: list[Tensor] = []
     above = torch.zeros_like(local[0])
-    for nodes, below in zip(local, largest, strict=True):
+    for nodes, below, before in zip(local, largest, grid.down(len(local)), strict=True):
         size = (nodes.shape[-2], nodes.shape[-1])
-        path = push(above, size) if levels else above
+        path = push(above, size, before=before) if levels else above
         levels.append(path + below)
         above = path + nodes
     return tuple(levels)

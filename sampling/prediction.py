@@ -21,6 +21,7 @@ from sampling.tiles import LocalErrors, local_errors
 from sampling.variance import pooled_covariance
 from torch_vdm import VDM
 from torch_vdm.cortex import Cortex
+from torch_vdm.grid import Grid
 from torch_vdm.matrix import mix
 
 # Images that are simulated for one prediction: as many as have `SIMULATED` pixels together. The
@@ -35,13 +36,14 @@ FEWEST_DRAWS, MOST_DRAWS, SIMULATED = 16, 64, 2**20
 # Status: fitted to the honest stop, see docs/sampling.md.
 QUANTILE, INEXACT = 2.1, 0.03
 
-# Power that stands for a maximum where a derivative is needed. Status: choice, measured.
-SHARPNESS = 4.0
+# Power of differences that stands for a maximum where a derivative is needed. Status: choice,
+# measured.
+SHARPNESS = 10.0
 
-# Power that stands for the largest of totals that scatter: the maximum of many that have a tail of
-# this power. That of differences scatters by 1.28 over its own power, 5 to 10 % and so 13 to 26,
-# and totals are differences to the power of 2.4. Status: derived, rounded.
-SOFTNESS = 8.0
+# Power of differences that stands for the largest of those that scatter: the maximum of many that
+# have a tail of this power scatters by 1.28 over it, and that of differences does by 5 to 10 %.
+# Status: derived, rounded.
+SOFTNESS = 20.0
 
 # Share of the samples that is spread evenly over all pixels that have shown noise, whatever is
 # believed of them: what is believed is sometimes wrong, and a pixel without samples does not tell.
@@ -112,7 +114,7 @@ class Model:
         return self._uncorrected(None)
 
     def _uncorrected(self, count: NDArray[np.float64] | None) -> Tensor:
-        return _finest(self.errors.at(self.leaves(count)))
+        return _finest(self.errors.at(self.leaves(count)), self.cortex.grid)
 
     def largest(self, count: NDArray[np.float64] | None = None) -> float:
         """Return what stands for the largest of the `totals` in a run, in which they scatter.
@@ -124,7 +126,8 @@ class Model:
         most = float(totals.amax())
         if most <= 0.0:
             return 0.0
-        return most * math.pow(float(((totals / most) ** SOFTNESS).sum()), 1.0 / SOFTNESS)
+        power = SOFTNESS / self.exponent
+        return most * math.pow(float(((totals / most) ** power).sum()), 1.0 / power)
 
     def leaves(self, count: NDArray[np.float64] | None = None) -> Tensor:
         """Return the variance of each pixel as `errors` takes it, (1, 3, H, W), single precision.
@@ -176,13 +179,15 @@ class Model:
         truth = _each(truth, Tensor.float)
         totals = self._totals(self.variance.float() * torch.exp(-logarithm), truth)
         largest = totals.detach().amax().clamp_min(1e-300)
-        (gradient,) = torch.autograd.grad(((totals / largest) ** SHARPNESS).sum(), logarithm)
+        power = SHARPNESS / self.exponent
+        (gradient,) = torch.autograd.grad(((totals / largest) ** power).sum(), logarithm)
         slopes = gradient.double().neg().clamp_min(0.0)
         return slopes / slopes.sum().clamp_min(1e-300)
 
     def _totals(self, variance: Tensor, truth: Cortex) -> Tensor:
         variances = detail_variances(variance, self.true_means)
-        return self._corrected(_finest(local_errors(self.metric, truth, variances, variance)))
+        local = local_errors(self.metric, truth, variances, variance)
+        return self._corrected(_finest(local, truth.grid))
 
     def _corrected(self, finest: Tensor) -> Tensor:
         return finest if self.correction is None else finest * self.correction
@@ -245,7 +250,8 @@ class Model:
                 tuple(a + b for a, b in zip(*planes, strict=True))
                 for planes in ((first.details, noise.details), (first.lowpass, noise.lowpass))
             )
-            return compare(Cortex(details, lowpass, first.mean + noise.mean)).double()
+            mean = first.mean + noise.mean
+            return compare(first._replace(details=details, lowpass=lowpass, mean=mean)).double()
 
         return seen
 
@@ -288,9 +294,9 @@ class Model:
         return torch.from_numpy(np.clip(variance, 0.0, LARGEST))[None]
 
 
-def _finest(local: tuple[Tensor, ...]) -> Tensor:
+def _finest(local: tuple[Tensor, ...], grid: Grid) -> Tensor:
     """Return the total errors of the finest nodes, (1, 1, h, w), float64."""
-    return total(local, maximum(local))[-1].double()
+    return total(local, maximum(local, grid), grid)[-1].double()
 
 
 def _to_cones(metric: VDM) -> Tensor:
@@ -379,8 +385,8 @@ def _factor(covariance: Tensor) -> Tensor:
 
 def _each(cortex: Cortex, function: Callable[[Tensor], Tensor]) -> Cortex:
     """Return the representation with every plane as a function makes it."""
-    return Cortex(
-        tuple(map(function, cortex.details)),
-        tuple(map(function, cortex.lowpass)),
-        function(cortex.mean),
+    return cortex._replace(
+        details=tuple(map(function, cortex.details)),
+        lowpass=tuple(map(function, cortex.lowpass)),
+        mean=function(cortex.mean),
     )

@@ -25,7 +25,7 @@ StopReason = Literal["tolerance", "noise_threshold", "max_spp"]
 StrategyName = Literal["perceptual", "objective", "uniform", "halfbuffer"]
 
 # What `state` is made of. Raised when an older state would be continued differently.
-STATE_VERSION = 4
+STATE_VERSION = 5
 
 # Share of the tolerance that a round aims at, for a prediction is not exact. Status: choice.
 AIM = 0.98
@@ -303,7 +303,11 @@ class Sampler:
         largest = float(totals.max()) ** (1.0 / model.exponent)
         # The boundary images say where, the simulation how much.
         scale = predicted / largest if largest > 0.0 else 1.0
-        jnd = push(totals, self.size)[0, 0].numpy() ** (1.0 / model.exponent) * scale
+        jnd = (
+            push(totals, self.size, before=model.cortex.grid.before(0))[0, 0].numpy()
+            ** (1.0 / model.exponent)
+            * scale
+        )
         drawn = int((statistics.first + statistics.drawn).sum())
         forecast, reason = 0, self._decided
         if reason is None:

@@ -26,15 +26,14 @@ SMALLEST_GROWTH = 1.05
 
 # The logarithm of the growth is found so well, or so well that the logarithm of the prediction lies
 # less than so much below the goal's: 1.6 % of the samples, 0.4 % of the JND. Status: choice.
-CLOSE, CLOSE_BELOW = 0.016, 0.01
+CLOSE, CLOSE_BELOW = 0.016, 0.004
 
-# Where the search begins: the totals fall by this power of the samples where the error falls by
-# their root. Status: choice.
-FALLING = 1.2
+# Where the search begins: differences fall by the root of the samples. Status: choice.
+FALLING = 0.5
 
 # It goes on as if they fell by no smaller power, for as a rule they fall faster once all pixels of
-# a largest total grow. Status: choice, measured.
-SLOWEST = 0.3
+# a largest one grow. Status: choice, measured.
+SLOWEST = 0.125
 
 
 class Strategy(Protocol):
@@ -170,8 +169,8 @@ def _growth(model: Model, worth: Plane, goal: float) -> float:
     smallest, largest = math.log(SMALLEST_GROWTH), math.log(LARGEST_GROWTH)
 
     def over(count: Plane | None) -> float:
-        """Return the logarithm of what stands for the largest total over the goal."""
-        return math.log(max(model.largest(count) / goal, 1e-300))
+        """Return the logarithm of what stands for the largest difference over the goal."""
+        return math.log(max(model.largest(count) / goal, 1e-300)) / model.exponent
 
     little, above = 0.0, over(None)
     if above <= 0.0:

@@ -16,6 +16,7 @@ from torch.nn import functional
 from sampling.boundary import QUARTILE, boundaries, detail_variances
 from torch_vdm import VDM
 from torch_vdm.cortex import Cortex
+from torch_vdm.grid import Before
 
 # Levels of no more nodes are computed whole: there an operation costs more than its numbers.
 # Status: choice, as in `torch_vdm.vdm`.
@@ -83,8 +84,11 @@ class _Cut(NamedTuple):
 class _Level:
     """A fine level of an image whose details stay, cut into tiles, or strips for all of it."""
 
-    def __init__(self, details: Tensor, parents: Tensor, finest: int) -> None:
-        self.size = height, width = details.shape[-2], details.shape[-1]
+    def __init__(self, details: Tensor, parents: Tensor, finest: int, before: Before) -> None:
+        self.before = before
+        # With what is put before the first node: all pieces begin where a parent does.
+        height, width = details.shape[-2] + before[0], details.shape[-1] + before[1]
+        self.size = height, width
         self.finest = finest
         self.tiles = _Cut(TILE, TILE, -(-height // TILE), -(-width // TILE))
         columns = _side(width, WIDEST, COLUMNS)
@@ -92,9 +96,9 @@ class _Level:
         self.strips = _Cut(rows, columns, -(-height // rows), -(-width // columns))
         down = max(cut.rows * cut.down for cut in (self.tiles, self.strips)) - height
         right = max(cut.columns * cut.across for cut in (self.tiles, self.strips)) - width
-        self._sides = (HALO, HALO + right, HALO, HALO + down)
+        self._sides = (HALO + before[1], HALO + right, HALO + before[0], HALO + down)
         self.details = self.padded(details)
-        # Of an odd side the last parent has one node.
+        # Of an odd side the last parent has one node; what is put before the first has its parent.
         left, right, top, down = (side // 2 for side in self._sides)
         self.parents = functional.pad(parents, (left, right, top, down), mode="replicate")
 
@@ -125,10 +129,19 @@ class LocalErrors:
         details = [detail.float() for detail in truth.details]
         lowpass = [plane.float() for plane in truth.lowpass]
         self._coarse = Cortex(
-            tuple(details[:few]), tuple(lowpass[: max(few, 1)]), truth.mean, len(nodes) - few
+            tuple(details[:few]),
+            tuple(lowpass[: max(few, 1)]),
+            truth.mean,
+            len(nodes) - few,
+            grid=truth.grid,
         )
         self._levels = [
-            _Level(details[number], lowpass[number - 1], len(nodes) - 1 - number)
+            _Level(
+                details[number],
+                lowpass[number - 1],
+                len(nodes) - 1 - number,
+                truth.before[number],
+            )
             for number in range(few, len(nodes))
         ]
         self._variances = detail_variances(leaves, metric.observer.true_means)[few:]
@@ -149,10 +162,11 @@ class LocalErrors:
         for level, variance, before, kept in zip(
             self._levels, variances[few:], self._variances, self._kept, strict=True
         ):
-            touched = _touched(variance, before, level.tiles)
+            touched = _touched(variance, before, level)
             skip = len(touched) <= pays * level.tiles.down * level.tiles.across
             again = (kept, touched) if skip else ()
-            local.append(self._computed(level, variance, *again))
+            top, left = level.before
+            local.append(self._computed(level, variance, *again)[..., top:, left:])
         return tuple(local)
 
     def touched(self, leaves: Tensor) -> float:
@@ -160,7 +174,7 @@ class LocalErrors:
         variances = detail_variances(leaves, self._metric.observer.true_means)
         fine = variances[len(self._coarse.details) :]
         found = [
-            len(_touched(variance, before, level.tiles))
+            len(_touched(variance, before, level))
             for level, variance, before in zip(self._levels, fine, self._variances, strict=True)
         ]
         return sum(found) / max(sum(len(level.tiles.places()) for level in self._levels), 1)
@@ -172,7 +186,10 @@ class LocalErrors:
         kept: Tensor | None = None,
         tiles: Sequence[Place] = (),
     ) -> Tensor:
-        """Return the local errors of a level, (1, 1, h, w): those that are kept but for tiles."""
+        """Return the local errors of a level, those that are kept but for tiles.
+
+        (1, 1, h, w), with what is put before the first nodes.
+        """
         if kept is None:
             local, cut = variance.new_empty(1, 1, *level.size), level.strips
             tiles = cut.places()
@@ -237,11 +254,11 @@ def local_errors(
     return (first + root.to(first), *others)
 
 
-def _touched(variance: Tensor, before: Tensor, tiles: _Cut) -> list[Place]:
+def _touched(variance: Tensor, before: Tensor, level: _Level) -> list[Place]:
     """Return the tiles in which a variance (1, 3, n, h, w), or that of a neighbour, differs."""
     differs = (variance != before).flatten(1, 2).any(1, keepdim=True).to(torch.float32)
-    height, width = differs.shape[-2:]
-    sides = (1, tiles.across * TILE - width + 1, 1, tiles.down * TILE - height + 1)
+    (height, width), (top, left), tiles = level.size, level.before, level.tiles
+    sides = (left + 1, tiles.across * TILE - width + 1, top + 1, tiles.down * TILE - height + 1)
     found = functional.max_pool2d(functional.pad(differs, sides), TILE + 2, TILE)[0, 0]
     return [(int(y), int(x)) for y, x in found.nonzero().tolist()]
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from benchmarks import places
 from tests.reference import calibrated
-from torch_vdm import Observer
+from torch_vdm import Haar, Observer
+from torch_vdm.cortex import Transform
 
 settings.register_profile("default", deadline=None, derandomize=True, max_examples=40)
 settings.load_profile("default")
@@ -53,10 +54,13 @@ def make_xyz(kind: str, height: int, width: int, seed: int) -> NDArray[np.float6
             raise ValueError(kind)
 
 
-def reference_numbers() -> calibrated.CalibratedParameters:
-    """Return the calibrated observer's numbers as the reference takes them."""
+def reference_numbers(transform: Transform | None = None) -> calibrated.CalibratedParameters:
+    """Return the calibrated observer's numbers, fitted to a transform, as the reference takes them.
+
+    To `Haar` by default.
+    """
     names = {field.name for field in dataclasses.fields(calibrated.CalibratedParameters)}
-    observer = Observer.calibrated()
+    observer = Observer.calibrated().fitted_to(transform or Haar())
     return calibrated.CalibratedParameters(
         **{name: value for name, value in vars(observer).items() if name in names}
     )

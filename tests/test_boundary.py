@@ -32,18 +32,13 @@ def test_variances_are_those_of_a_linear_map(height: int, width: int, true_means
 
 
 def test_an_interior_node_has_a_sixteenth_of_its_children() -> None:
-    variance = torch.rand(2, 3, 4, 4, dtype=torch.float64)
-    coarse, fine = (
-        found.expand(-1, -1, 3, -1, -1) for found in detail_variances(variance, true_means=True)
-    )
-    for y in range(2):
-        for x in range(2):
-            block = variance[:, :, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2].sum((-2, -1)) / 16.0
-            for orientation in range(3):
-                torch.testing.assert_close(fine[:, :, orientation, y, x], block)
-    torch.testing.assert_close(
-        coarse[..., 0, 0], variance.sum((-2, -1))[..., None].repeat(1, 1, 3) / 256
-    )
+    variance = torch.rand(2, 3, 12, 12, dtype=torch.float64)
+    *_, coarse, fine = detail_variances(variance, true_means=True)
+    # On the grid of thirds both nodes begin at odd pixels: of 2, and of 4.
+    for level, node, begin in ((fine, 2, 1), (coarse, 4, 3)):
+        block = variance[:, :, begin : begin + node, begin : begin + node].sum((-2, -1))
+        for orientation in range(3):
+            torch.testing.assert_close(level[:, :, orientation, 1, 1], block / node**4)
 
 
 def made(seed: int) -> tuple[Cortex, tuple[Tensor, ...], Tensor]:
@@ -51,7 +46,7 @@ def made(seed: int) -> tuple[Cortex, tuple[Tensor, ...], Tensor]:
     plane = torch.rand(1, 3, 8, 8, generator=generator, dtype=torch.float64)
     noise = 0.1 * torch.rand(1, 3, 8, 8, generator=generator, dtype=torch.float64)
     return (
-        Haar().decompose(plane),
+        Haar().decompose(plane, true_means=True),
         detail_variances(noise, true_means=True),
         noise.mean((-2, -1), keepdim=True) / 64,
     )
@@ -61,7 +56,7 @@ def made(seed: int) -> tuple[Cortex, tuple[Tensor, ...], Tensor]:
 def test_boundaries_lie_at_the_quartiles(signed: bool) -> None:
     cortex, variances, mean_variance = made(1)
     lower, upper = boundaries(cortex, variances, mean_variance, QUARTILE, signed)
-    for level in range(3):
+    for level in range(len(cortex.details)):
         numbers = zip(
             cortex.details[level].flatten().tolist(),
             variances[level].expand_as(cortex.details[level]).flatten().tolist(),

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from torch_vdm import VDM, Display, StationaryHaar, Steerable, __version__
+from torch_vdm import VDM, Display, Haar, StationaryHaar, Steerable, __version__
 from torch_vdm.cli import main
+from torch_vdm.cortex import Transform
 from torch_vdm.io import read_image, write_image
 
 Pair = tuple[str, str]
@@ -51,13 +52,13 @@ def one_line_error(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 def test_json_has_the_figures_of_the_metric(pair: Pair, capsys: pytest.CaptureFixture[str]) -> None:
     told = run_json(capsys, *pair, "--ppd", "48", "--peak", "250", "--exposure", "-1")
     reference, test = (read_image(path)[None] for path in pair)
-    metric = VDM(48.0, Display.srgb(250.0, exposure=-1.0))
+    metric = VDM(48.0, Display.srgb(250.0, exposure=-1.0), transform=StationaryHaar("filter"))
     jnd = metric(test, reference)
     assert told["max_jnd"] == pytest.approx(jnd.max().item())
     assert told["mean_jnd"] == pytest.approx(jnd.mean().item())
     assert told["score_jnd"] == pytest.approx(metric.score(test, reference).item())
     assert (told["width"], told["height"], told["ppd"]) == (30, 20, 48.0)
-    assert told["accuracy"] == "fast"
+    assert told["accuracy"] == "standard"
     assert told["observer"] == "calibrated"
     assert told["effects"] == ["aberration", "chromatic", "masking", "pooling"]
     assert told["version"] == __version__
@@ -88,7 +89,8 @@ def test_the_raw_map_is_an_exr(pair: Pair, tmp_path: Path) -> None:
     raw = tmp_path / "map.exr"
     assert main(["compare", *pair, "--map", str(raw)]) == 0
     reference, test = (read_image(path)[None] for path in pair)
-    torch.testing.assert_close(read_image(raw)[:1], VDM()(test, reference)[0])
+    expected = VDM(transform=StationaryHaar("filter"))(test, reference)[0]
+    torch.testing.assert_close(read_image(raw)[:1], expected)
 
 
 def test_fail_above_is_told_by_the_status(pair: Pair) -> None:
@@ -258,12 +260,13 @@ def test_jnd_falls_with_samples_per_pixel(
 
 
 @pytest.mark.parametrize(
-    ("accuracy", "transform"), [("standard", StationaryHaar("filter")), ("reference", Steerable())]
+    ("accuracy", "transform"),
+    [("fast", Haar()), ("standard", StationaryHaar("filter")), ("reference", Steerable())],
 )
 def test_accuracy_is_the_transform(
     pair: Pair,
     accuracy: str,
-    transform: StationaryHaar | Steerable,
+    transform: Transform,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     told = run_json(capsys, *pair, "--accuracy", accuracy)
@@ -273,6 +276,16 @@ def test_accuracy_is_the_transform(
     assert told["max_jnd"] == pytest.approx(metric(test, reference).max().item())
     assert told["score_jnd"] == pytest.approx(metric.score(test, reference).item())
     assert f"--accuracy {accuracy}" in str(told["reproduce"])
+    # What the quickest may miss is told.
+    assert ("missed" in str(told["assumptions"])) == (accuracy == "fast")
+
+
+def test_the_papers_observer_has_the_papers_transform(
+    pair: Pair, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = run_json(capsys, *pair, "--observer", "paper")
+    assert told["accuracy"] == "fast"
+    assert "missed" not in str(told["assumptions"])
 
 
 def test_an_unknown_accuracy_is_refused(pair: Pair, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,17 +10,22 @@ import torch
 from tests.conftest import KINDS, make_xyz
 from tests.reference import calibrated, paper
 from torch_vdm.cortex import Haar
+from torch_vdm.grid import PAPERS
 
 
 @pytest.mark.parametrize("true_means", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("size", [(1, 1), (1, 9), (6, 1), (8, 8), (13, 21), (12, 33)])
+@pytest.mark.parametrize(
+    "size", [(1, 1), (1, 9), (6, 1), (8, 8), (13, 21), (12, 33), (2, 3), (4, 5)]
+)
 def test_is_the_reference(kind: str, size: tuple[int, int], true_means: bool) -> None:
     planes = make_xyz(kind, *size, 3)
     reference = calibrated if true_means else paper
     expected = reference.cortex_filtering(planes)
     actual = Haar().decompose(torch.from_numpy(planes)[None], true_means=true_means)
-    assert len(actual.details) == paper.level_count(*size)
+    assert len(actual.details) == len(expected.details)
+    if not true_means:
+        assert len(actual.details) == paper.level_count(*size)
     rounding = 1e-15 * float(np.abs(planes).max())
     for ours, theirs in zip(actual.details, expected.details, strict=True):
         # The reference puts orientations before channels.
@@ -67,19 +72,49 @@ def test_peaks_at_64_pixels_per_degree() -> None:
     np.testing.assert_allclose(gains, [1, 0.770, 0.735, 0.727, 0.725, 0.725], atol=6e-4)
 
 
-@pytest.mark.parametrize("size", [(8, 8), (13, 21), (1, 33), (65, 64)])
+ODD = [(8, 8), (13, 21), (1, 33), (22, 3), (2, 5), (16, 17)]
+
+
+@pytest.mark.parametrize("size", ODD, ids=str)
 def test_every_pixel_has_the_same_weight_in_true_means(size: tuple[int, int]) -> None:
-    planes = torch.rand(
-        1, 3, *size, dtype=torch.float64, generator=torch.Generator().manual_seed(2)
-    )
-    cortex = Haar().decompose(planes, true_means=True)
-    torch.testing.assert_close(cortex.lowpass[0], planes.mean((-2, -1), keepdim=True))
+    # What each coefficient is made of: its responses to an impulse in each pixel.
+    height, width = size
+    impulses = torch.eye(height * width, dtype=torch.float64).view(-1, 1, height, width)
+    cortex = Haar().decompose(impulses, true_means=True)
+    grid = calibrated.grid_of(height, width)[:0:-1]
+    for (rows, columns), lowpass, details in zip(grid, cortex.lowpass, cortex.details, strict=True):
+        weights = lowpass[:, 0].view(height, width, rows.nodes(), columns.nodes())
+        expected = torch.zeros_like(weights)
+        for y in range(rows.nodes()):
+            for x in range(columns.nodes()):
+                down, across = rows.pixels(y), columns.pixels(x)
+                share = 1.0 / (len(down) * len(across))
+                expected[down.start : down.stop, across.start : across.stop, y, x] = share
+        torch.testing.assert_close(weights, expected)
+        # Along a difference no pixel has more than one of a whole node has; along a sum those
+        # beside a border stand for the pixels that are not there, and count twice at most.
+        if min(rows.nodes(), columns.nodes()) > 1:
+            assert details.abs().max() <= 2.0 / (rows.node * columns.node) * (1.0 + 1e-12)
+            along_both = details[:, :, 2].abs().max()
+            assert along_both <= 1.0 / (rows.node * columns.node) * (1.0 + 1e-12)
 
 
-def test_flat_images_have_no_details() -> None:
-    cortex = Haar().decompose(torch.full((1, 3, 21, 10), 0.3))
+@pytest.mark.parametrize("true_means", [False, True])
+@pytest.mark.parametrize("size", [(21, 10), (64, 64), (16, 3)])
+def test_flat_images_have_no_details(size: tuple[int, int], true_means: bool) -> None:
+    cortex = Haar().decompose(torch.full((1, 3, *size), 0.3), true_means=true_means)
     assert not any(details.any() for details in cortex.details)
     assert all((lowpass == 0.3).all() for lowpass in cortex.lowpass)
+
+
+def test_the_papers_nodes_begin_with_the_image() -> None:
+    image = torch.rand(1, 3, 13, 21, dtype=torch.float64)
+    printed = Haar().decompose(image)
+    assert printed.grid == PAPERS
+    assert set(printed.before) == {(0, 0)}
+    again = Haar().decompose(image, true_means=True, grid=PAPERS)
+    # But for the border, the details of the two grids differ in nothing else.
+    assert torch.equal(printed.details[-1][..., :-1, :-1], again.details[-1][..., :-1, :-1])
 
 
 def test_is_linear() -> None:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.golden import STIMULI, read, threshold
+from tests.golden import CASES, STIMULI, read, threshold
 
 GOLDEN = read()
 
@@ -11,11 +11,12 @@ GOLDEN = read()
 TOLERANCE = 0.03
 
 
-def test_every_stimulus_has_a_golden_threshold() -> None:
-    assert GOLDEN.keys() == STIMULI.keys()
+def test_every_case_has_a_golden_threshold() -> None:
+    assert list(GOLDEN) == CASES
 
 
-@pytest.mark.parametrize("name", STIMULI)
-def test_thresholds_are_golden(name: str) -> None:
+@pytest.mark.parametrize("case", CASES, ids=", ".join)
+def test_thresholds_are_golden(case: tuple[str, str]) -> None:
+    name, accuracy = case
     with torch.no_grad():
-        assert threshold(STIMULI[name]) == pytest.approx(GOLDEN[name], abs=TOLERANCE)
+        assert threshold(STIMULI[name], accuracy) == pytest.approx(GOLDEN[case], abs=TOLERANCE)

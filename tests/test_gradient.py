@@ -42,7 +42,9 @@ def test_is_autograds(
     ours = gradients(VDM(), noise(size), wanted)
     monkeypatch.setattr(vdm, "by_hand", lambda: False)
     for mine, theirs in zip(ours, gradients(VDM(), noise(size), wanted), strict=True):
-        torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-13)
+        # Of the largest: a slope may be what two that are millions of times as large leave.
+        largest = 0.0 if theirs is None else float(theirs.abs().max())
+        torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-15 * largest)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """What must hold of the metric whatever its constants are."""
 
+import dataclasses
 import itertools
 import math
 
@@ -85,17 +86,25 @@ def test_padding_by_repetition_does_not_matter() -> None:
 @pytest.mark.parametrize("pixel", [(0, 0), (0, -1), (-1, 0), (-1, -1)])
 def test_the_border_of_an_odd_side_weighs_no_more(size: int, pixel: tuple[int, int]) -> None:
     # One white pixel in a corner, where the far corner has no share in it: as at 64 x 64.
-    def seen(side: int, y: int, x: int) -> tuple[float, float]:
+    def seen(observer: Observer, side: int, y: int, x: int) -> tuple[float, float]:
         flat = torch.full((1, 3, side, side), 0.5)
         dotted = flat.clone()
         dotted[..., y, x] = 1.0
-        jnd = VDM(PPD)(dotted, flat)[0, 0]
+        jnd = VDM(PPD, observer=observer)(dotted, flat)[0, 0]
         return jnd[y, x].item(), jnd[-1 - y, -1 - x].item()
 
-    (near, far), (expected_near, expected_far) = seen(size, *pixel), seen(64, *pixel)
-    # A corner of few pixels is adapted to its dot.
-    assert 0.5 * expected_near < near < 1.4 * expected_near
-    assert far < 1.2 * expected_far
+    charged = Observer.calibrated()
+    all_of_it = dataclasses.replace(charged, charging=False)
+    for observer in (charged, all_of_it):
+        near, far = seen(observer, size, *pixel)
+        expected_near, expected_far = seen(observer, 64, *pixel)
+        # A corner of few pixels is adapted to its dot.
+        assert 0.5 * expected_near < near < 1.4 * expected_near
+        # The root's children have 43 and 21 pixels a side at 64 x 64, and at 95 x 95 43 and 52: its
+        # wavelet, which the far corner is seen by if it is charged, has twice as many of the
+        # smaller.
+        assert far <= 1.4 * expected_far
+        assert (far == 0.0) == observer.charging
 
 
 @each_observer
@@ -173,13 +182,3 @@ def test_a_grating_is_less_visible_on_a_busy_texture(observer: Observer) -> None
     # The printed transducer masks more than people do; the calibrated one as they do.
     share = 0.9 if observer.signed else 0.7
     assert metric(texture + added, texture).mean() < share * metric(flat + added, flat).mean()
-
-
-@each_observer
-def test_the_score_grows_with_the_area_of_the_stimulus(observer: Observer) -> None:
-    metric = linear_metric(observer)
-    scores = [
-        metric.score(grating(4.0, 0.05, size=size), grating(4.0, 0.0, size=size)).item()
-        for size in (32, 64, 128)
-    ]
-    assert scores[0] < scores[1] < scores[2]

@@ -3,13 +3,15 @@
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.conftest import reference_numbers
 from tests.reference import calibrated, paper
-from torch_vdm.masking import energy_transducer, signed_transducer
+from torch_vdm.masking import energy_transducer, masking_energy, signed_transducer
 
 Q = torch.tensor(0.3, dtype=torch.float64)
 
@@ -23,7 +25,15 @@ def test_eq_4_is_the_reference(energy: float) -> None:
 @given(contrast=st.floats(-1e6, 1e6))
 def test_signed_is_the_reference(contrast: float) -> None:
     actual = signed_transducer(torch.tensor(contrast, dtype=torch.float64), Q).item()
-    assert actual == pytest.approx(calibrated.transducer(contrast, 0.3), rel=1e-9)
+    assert actual == pytest.approx(calibrated.transducer(contrast, contrast**2, 0.3), rel=1e-9)
+
+
+def test_all_orientations_of_a_channel_mask_alike() -> None:
+    weighted = np.random.default_rng(1).normal(scale=3.0, size=(4, 3, 5, 6))
+    expected = calibrated.masking_transducer(weighted, paper.ALL_ON, reference_numbers())
+    planes = torch.from_numpy(weighted).transpose(0, 1)[None]
+    actual = signed_transducer(planes, Q, masking_energy(planes))
+    np.testing.assert_allclose(actual[0].transpose(0, 1).numpy(), expected, rtol=1e-12)
 
 
 def test_both_are_1_at_threshold() -> None:

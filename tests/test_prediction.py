@@ -8,6 +8,7 @@ from sampling.prediction import (
     EVEN,
     MOST_DRAWS,
     PLACING_DOUBT,
+    SHARPNESS,
     SOFTNESS,
     Model,
     _factor,
@@ -102,9 +103,10 @@ def test_what_stands_for_the_largest_total_counts_those_that_are_nearly_as_large
     model = Model(VDM(60.0, Display.linear(), observer), drawn(renderer, 32), renderer.size)
     totals = model.totals()
     nodes = totals.numel()
-    expected = float((totals**SOFTNESS).sum()) ** (1.0 / SOFTNESS)
+    power = SOFTNESS / observer.summation_exponent
+    expected = float((totals**power).sum()) ** (1.0 / power)
     assert model.largest() == pytest.approx(expected, rel=1e-12)
-    assert float(totals.max()) < expected <= nodes ** (1.0 / SOFTNESS) * float(totals.max())
+    assert float(totals.max()) < expected <= nodes ** (1.0 / power) * float(totals.max())
     # One half alone improves: the largest total falls as far at most as if the whole did.
     half = model.count * np.where(np.arange(16) < 8, 4.0, 1.0)
     assert model.largest(4.0 * model.count) < model.largest(half) < model.largest()
@@ -126,7 +128,7 @@ def test_slopes_are_the_derivative_of_the_largest_totals(observer: Observer) -> 
             with torch.no_grad():
                 variance = model.single_variance / torch.from_numpy(count.reshape(5, 6))
                 totals = model._totals(variance, model.truth) / model.totals().max()
-            sums.append(float((totals**4.0).sum()))
+            sums.append(float((totals ** (SHARPNESS / observer.summation_exponent)).sum()))
     slopes = np.array(sums).reshape(3, 2) @ [-0.5e4, 0.5e4]
     np.testing.assert_allclose(
         slopes / slopes.sum(),

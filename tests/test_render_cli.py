@@ -79,7 +79,7 @@ def figures(path: Path) -> dict[str, Any]:
 def whole(scene: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], Path]:
     """Return the arguments of a run, without its output, and the image of it."""
     output = tmp_path_factory.mktemp("whole") / "out.exr"
-    arguments = [scene, *SMALL, "--tolerance", "2", "--seed", "7", "--aov"]
+    arguments = [scene, *SMALL, "--tolerance", "0.7", "--seed", "7", "--aov"]
     assert main([*arguments, "--output", str(output), "--json", f"{output}.json"]) == 0
     return arguments, output
 
@@ -88,9 +88,9 @@ def test_the_image_and_the_figures(whole: tuple[list[str], Path]) -> None:
     _, output = whole
     told, planes = figures(Path(f"{output}.json")), channels(output)
     assert set(told) >= KEYS
-    assert (told["strategy"], told["seed"], told["tolerance"]) == ("perceptual", 7, 2.0)
+    assert (told["strategy"], told["seed"], told["tolerance"]) == ("perceptual", 7, 0.7)
     assert (told["stop_reason"], told["converged"]) == ("tolerance", True)
-    assert 0.0 < told["predicted_max_jnd"] <= 2.0
+    assert 0.0 < told["predicted_max_jnd"] <= 0.7
     assert told["rounds"] >= 2
     assert told["variant"] in ("llvm_ad_rgb", "cuda_ad_rgb")
     assert (told["plan"]["integrator"], told["plan"]["max_depth"]) == ("path", 4)

@@ -13,7 +13,7 @@ from torch_vdm.report import Comparison, _shrunk_map, figures, shrunk, write_hea
 def comparison(**changes: object) -> Comparison:
     values: dict[str, object] = {
         "max_jnd": 3.2, "max_pixel": (4, 5), "mean_jnd": 1.0, "p95_jnd": 2.0,
-        "visible_fraction": 0.25, "score_jnd": 5.0, "mean_luminance_change": 0.0, "width": 8,
+        "visible_fraction": 0.25, "score_jnd": 3.2, "mean_luminance_change": 0.0, "width": 8,
         "height": 9, "ppd": 60.0, "accuracy": "fast", "observer": "calibrated", "effects": [],
         "seconds": 0.1, "assumptions": [], "version": "0", "reproduce": "",
     }  # fmt: skip
@@ -59,9 +59,7 @@ def test_the_picture_of_a_large_map_keeps_its_largest_value() -> None:
 def test_verdicts() -> None:
     assert "up to 3.2 JND (at x 4, y 5), in 25.0% of the image" in comparison().verdict()
     assert "under 0.1%" in comparison(visible_fraction=1e-4).verdict()
-    together = comparison(max_jnd=0.9, score_jnd=1.4).verdict()
-    assert together.startswith("Hardly visible at 60 pixels per degree")
-    invisible = comparison(max_jnd=0.9, score_jnd=0.8, visible_fraction=0.0).verdict()
+    invisible = comparison(max_jnd=0.9, score_jnd=0.9, visible_fraction=0.0).verdict()
     assert invisible.startswith("Nobody will see a difference at 60 pixels per degree")
 
 

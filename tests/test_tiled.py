@@ -109,7 +109,7 @@ def test_options_go_with_the_tiles() -> None:
 
 
 def test_only_what_is_needed_is_read_and_steps_are_told() -> None:
-    test, reference = images(64, 200, torch.float32)
+    test, reference = images(64, 400, torch.float32)
     largest = 0
 
     class Watched:
@@ -124,12 +124,13 @@ def test_only_what_is_needed_is_read_and_steps_are_told() -> None:
             return part
 
     steps: list[tuple[int, int]] = []
-    out = torch.zeros(1, 64, 200)
+    out = torch.zeros(1, 64, 400)
     given = VDM().tiled(test[0], Watched(), 32, out, lambda done, of: steps.append((done, of)))
     assert given is out
     torch.testing.assert_close(out, VDM()(test, reference)[0], rtol=0.0, atol=1e-5)
-    assert largest <= 64 * (32 + 2 * 32)
-    assert steps == [(done, 28) for done in range(1, 29)]
+    assert largest <= 64 * (32 + 2 * 96)
+    # 3 x 13 tiles, for the first begin before the image; each is read twice.
+    assert steps == [(done, 78) for done in range(1, 79)]
 
 
 def test_nonfinite_pixels_are_named_or_masked() -> None:

@@ -97,7 +97,15 @@ def test_the_share_touched_counts_tiles(size: tuple[int, int]) -> None:
     ]
     assert none == 0.0
     # A corner lies in one tile of each level.
-    levels = [-(-side // 2) for side in size], [-(-side // 4) for side in size]
-    cut = [-(-y // TILE) * -(-x // TILE) for y, x in levels if y * x > 64 * 64]
+    shapes = [detail.shape[-2:] for detail in model.cortex.details[-1:-3:-1]]
+    levels = [
+        [side + more for side, more in zip(shape, before, strict=True)]
+        for shape, before in zip(shapes, model.cortex.before[-1:-3:-1], strict=True)
+    ]
+    cut = [
+        -(-y // TILE) * -(-x // TILE)
+        for (y, x), (h, w) in zip(levels, shapes, strict=True)
+        if h * w > 64 * 64
+    ]
     assert one == pytest.approx(len(cut) / sum(cut))
     assert every == 1.0

@@ -76,6 +76,18 @@ def reference_levels(
     return transforms.steerable(plane, [transform.peaks(level)[0][0] for level in range(8)])
 
 
+def reference_map(
+    transform: Transform, test: NDArray[np.float64], reference: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    numbers = reference_numbers(transform)
+    if transform == Haar("filter"):
+        return transforms.filtered_haar_map(test, reference, PPD, numbers)
+    kind = "stationary" if isinstance(transform, StationaryHaar) else "steerable"
+    kind = "filtered" if transform.csf == "filter" else kind
+    peaks = [transform.peaks(level)[0] for level in range(8)]
+    return transforms.jnd_map(test, reference, PPD, kind, peaks, numbers)
+
+
 @pytest.mark.parametrize("transform", [StationaryHaar(), Steerable()], ids=name)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("size", SIZES)
@@ -97,29 +109,19 @@ def test_is_the_reference(transform: Transform, kind: str, size: tuple[int, int]
             np.testing.assert_allclose(ours, lowpass, rtol=1e-9, atol=atol)
 
 
-@each_overlapping
+@pytest.mark.parametrize("transform", [*OVERLAPPING, Haar("filter")], ids=name)
 @pytest.mark.parametrize("kind", ["random", "hdr", "dark", "negative"])
 @pytest.mark.parametrize("size", [(1, 1), (7, 10)])
-def test_the_map_and_the_score_are_the_references(
-    transform: Transform, kind: str, size: tuple[int, int]
-) -> None:
+def test_the_map_is_the_references(transform: Transform, kind: str, size: tuple[int, int]) -> None:
     first, second = make_xyz(kind, *size, 1), make_xyz("random", *size, 2)
-    kind_of = "stationary" if isinstance(transform, StationaryHaar) else "steerable"
-    kind_of = "filtered" if transform.csf == "filter" else kind_of
-    observer = Observer.calibrated()
-    peaks = [transform.peaks(level)[0] for level in range(8)]
-    metric = VDM(PPD, Display.xyz(), observer, transform)
+    # In a part they are equal: there a node is charged little of what its parent has.
+    second[:, : size[0] // 2, 3:] = first[:, : size[0] // 2, 3:]
+    metric = VDM(PPD, Display.xyz(), transform=transform)
     images = [torch.from_numpy(image)[None] for image in (first, second)]
-    arguments = (first, second, PPD, kind_of, peaks, reference_numbers())
-    expected = transforms.jnd_map(*arguments)
+    expected = reference_map(transform, first, second)
     np.testing.assert_allclose(metric(*images)[0, 0].numpy(), expected, rtol=1e-9, atol=1e-9)
     single = metric(*(image.float() for image in images))[0, 0].double().numpy()
     np.testing.assert_allclose(single, expected, rtol=1e-3, atol=1e-3)
-    exponent = observer.score_exponent
-    root = metric.lowpass_difference(*(metric.represent(image) for image in images))
-    total = transforms.score_sum(*arguments, exponent) / observer.score_coefficients
-    score = (total + (root**exponent).sum().item()) ** (1.0 / exponent)
-    assert metric.score(*images).item() == pytest.approx(score, rel=1e-6)
 
 
 @pytest.mark.parametrize("level", range(6))
@@ -140,7 +142,7 @@ def test_the_filter_is_the_reference(
 ) -> None:
     image = make_xyz(kind, *size, 1)
     seen = VDM(PPD, Display.xyz(), transform=transform).represent(torch.from_numpy(image)[None])
-    weighted = transforms.weighted_contrast(image, PPD, reference_numbers())
+    weighted = transforms.weighted_contrast(image, PPD, reference_numbers(transform))
     largest = float(np.abs(weighted).max())
     if isinstance(transform, Haar):
         details = calibrated.cortex_filtering(weighted).details
@@ -192,7 +194,8 @@ def test_a_filtered_grating_has_its_contrast_sensitivity(
     seen = metric._weighted_contrast(planes)[0, 0, 96:160, 96:160]
     amplitude = float(seen.square().mean().sqrt()) * math.sqrt(2.0)
     mean = 0.5 * luminance
-    expected = 1.0147 * 0.01 * calibrated.sensitivity(cpd, mean, reference_numbers())[0]
+    numbers = reference_numbers(Haar("filter"))
+    expected = 1.0147 * 0.01 * calibrated.sensitivity(cpd, mean, numbers)[0]
     assert abs(20.0 * math.log10(amplitude / expected)) < within
 
 
@@ -408,14 +411,18 @@ def test_large_planes_in_parts_are_the_same(
 
 
 def thresholds(metric: VDM, cpd: float, angles: list[float]) -> Tensor:
-    """Return the contrasts, dB, at which gratings of angles and of four phases score 1 JND."""
+    """Return the contrasts, dB, at which gratings of angles and of four phases are seen with 1 JND.
+
+    Away from the border, where a grating ends in another phase each time.
+    """
     contrast = torch.full((len(angles), 4), 0.002, dtype=torch.float64)
     flat = grating(cpd / PPD, 0.0).expand(contrast.numel(), -1, -1, -1)
     phases = [step * math.pi / 4.0 for step in range(4)]
     unit = torch.cat([grating(cpd / PPD, 1.0, p, a) for a in angles for p in phases])
     for _ in range(3):
         test = flat + contrast.view(-1, 1, 1, 1) * (unit - flat)
-        contrast = contrast / metric.score(test, flat).view_as(contrast)
+        largest = metric(test, flat)[..., 32:96, 32:96].amax((1, 2, 3))
+        contrast = contrast / largest.view_as(contrast)
     return 20.0 * torch.log10(contrast)
 
 
@@ -432,12 +439,14 @@ def test_the_threshold_hardly_depends_on_phase(transform: Transform, cpd: float)
 def test_the_threshold_hardly_depends_on_orientation(
     transform: Transform, cpd: float, request: pytest.FixtureRequest
 ) -> None:
-    if transform == StationaryHaar() and cpd > 2.0:
+    if transform == StationaryHaar() and cpd > 5.0:
         # A coarse level, more sensitive, sees vertical gratings of finer ones, diagonal ones less.
-        short = pytest.mark.xfail(reason="1.7 dB at 5 and 2.0 dB at 8 cycles/degree", strict=True)
+        short = pytest.mark.xfail(reason="2.2 dB at 8 cycles/degree", strict=True)
         request.applymarker(short)
     straight, turned = thresholds(metric_of(transform), cpd, [0.0, 45.0]).mean(1)
-    assert abs(straight - turned) < 1.0
+    # Where phase matters, as with Haar, or contrast sensitivity acts on levels, up to 1.8 dB.
+    within = 2.0 if transform in (StationaryHaar(), Haar("filter")) else 1.0
+    assert abs(straight - turned) < within
 
 
 @each_overlapping
@@ -446,14 +455,41 @@ def test_the_map_of_a_grating_is_even(transform: Transform, cpd: float) -> None:
     flat = grating(cpd / PPD, 0.0)
     inner = metric_of(transform)(grating(cpd / PPD, 0.02), flat)[..., 32:96, 32:96]
     low, high = inner.quantile(0.05), inner.quantile(0.95)
-    assert 20.0 * torch.log10(high / low) < 0.6
+    assert 20.0 * torch.log10(high / low) < 0.85
+
+
+def brighter(side: int, y: int, x: int, contrast: float) -> Tensor:
+    image = torch.full((1, 3, 256, 256), 0.5)
+    image[..., y : y + side, x : x + side] *= 1.0 + contrast
+    return image
+
+
+@pytest.mark.parametrize("contrast", [0.01, 0.04])
+@pytest.mark.parametrize("side", [16, 32, 64, 128])
+@pytest.mark.parametrize("transform", [*FILTERED, Haar()], ids=name)
+def test_a_tile_is_seen_as_well_at_multiples_of_its_side(
+    transform: Transform, side: int, contrast: float
+) -> None:
+    # Its edges lie on node borders of the paper's grid, where a tile of 16 pixels is seen 12 dB
+    # less than elsewhere. Of ten other places, the median: at some it is seen less than at most.
+    metric = metric_of(transform)
+    places = torch.randint(1, 256 - side, (10, 2), generator=torch.Generator().manual_seed(side))
+    flat = brighter(side, 0, 0, 0.0)
+
+    def seen(y: int, x: int) -> float:
+        largest = metric(brighter(side, y, x, contrast), flat).max().item()
+        return 20.0 * math.log10(largest)
+
+    elsewhere = float(np.median([seen(*place) for place in places.tolist()]))
+    assert abs(seen(side, side) - elsewhere) < 3.0
 
 
 @each_overlapping
-def test_scores_about_what_haar_scores(transform: Transform) -> None:
-    # The same coefficients a stimulus, whatever the number of shifts and phases. Not the same
-    # responses: Haar's leave traces in more levels.
+def test_sees_about_what_haar_sees(transform: Transform) -> None:
+    # Whatever the number of shifts and phases. Not the same responses: Haar's leave traces in more
+    # levels.
     test, reference = random_images(1, 1, 128, 128), random_images(2, 1, 128, 128)
-    plain = metric_of(Haar()).score(0.3 + 0.02 * test, 0.3 + 0.02 * reference)
-    ours = metric_of(transform).score(0.3 + 0.02 * test, 0.3 + 0.02 * reference)
-    assert 0.65 < (ours / plain).item() < 1.4
+    plain = metric_of(Haar())(0.3 + 0.02 * test, 0.3 + 0.02 * reference)
+    ours = metric_of(transform)(0.3 + 0.02 * test, 0.3 + 0.02 * reference)
+    assert 0.5 < (ours.max() / plain.max()).item() < 1.4
+    assert 0.5 < (ours.mean() / plain.mean()).item() < 1.4

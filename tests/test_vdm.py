@@ -97,13 +97,16 @@ def test_every_choice_of_effects_is_the_reference(observer: Observer, effects: E
     np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-9)
 
 
-@given(size=sizes, kinds=st.tuples(*[st.sampled_from(KINDS)] * 2), seed=st.integers(0, 2**16))
-def test_score_is_the_reference(size: tuple[int, int], kinds: tuple[str, str], seed: int) -> None:
-    test, reference = (make_xyz(kind, *size, seed + n) for n, kind in enumerate(kinds))
-    expected = calibrated.detection_score(test, reference, PPD, reference_numbers())
-    both = (torch.as_tensor(image)[None] for image in (test, reference))
-    actual = VDM(PPD, Display.xyz()).score(*both).item()
-    assert actual == pytest.approx(expected, rel=1e-9, abs=1e-9)
+@pytest.mark.parametrize("transform", TRANSFORMS, ids=repr)
+@pytest.mark.parametrize(
+    "observer", [Observer.paper(), Observer.calibrated()], ids=lambda o: o.name
+)
+def test_the_score_is_the_largest_value_of_the_map(
+    observer: Observer, transform: Transform
+) -> None:
+    pair = images()
+    metric = VDM(PPD, observer=observer, transform=transform)
+    assert torch.equal(metric.score(*pair), metric(*pair).amax((1, 2, 3)))
 
 
 def images(batch: int = 2, height: int = 21, width: int = 34) -> tuple[torch.Tensor, torch.Tensor]:
@@ -194,7 +197,10 @@ def test_items_below_one_another_are_seen_each_by_itself(
 def test_many_beside_one_are_compared_as_each_with_it(
     size: tuple[int, int], observer: Observer, transform: Transform
 ) -> None:
-    metric = VDM(PPD, observer=observer, transform=transform)
+    # Nothing is charged beside one that stays.
+    uncharged = dataclasses.replace(observer, charging=False)
+    charged = VDM(PPD, observer=observer, transform=transform)
+    metric = VDM(PPD, observer=uncharged, transform=transform)
     first, others = (
         metric.represent(image.double()) for image in (images(1, *size)[0], images(3, *size)[1])
     )
@@ -203,8 +209,8 @@ def test_many_beside_one_are_compared_as_each_with_it(
         lowpass=tuple(plane.expand(3, *plane.shape[1:]) for plane in first.lowpass),
         mean=first.mean.expand(3, -1, -1, -1),
     )
-    torch.testing.assert_close(metric.beside(first)(others), metric.compare(same, others))
-    assert (metric.beside(first)(first) == 0.0).all()
+    torch.testing.assert_close(charged.beside(first)(others), metric.compare(same, others))
+    assert (charged.beside(first)(first) == 0.0).all()
 
 
 def test_the_fast_route_is_never_compiled_again() -> None:
@@ -300,7 +306,7 @@ def test_wrong_options_are_refused(arguments: dict[str, object], message: str) -
         ({"band_width": float("nan")}, "band_width: a finite number over 0, got nan"),
         ({"red_green_gain": -1.0}, "red_green_gain: a finite number from 0, got -1"),
         ({"lowpass_gains": (1.0, 2.0)}, "lowpass_gains: three or None"),
-        ({"score_window": 4}, "score_window: an odd number, got 4"),
+        ({"summation_exponent": 0.0}, "summation_exponent: a finite number over 0, got 0"),
     ],
 )
 def test_wrong_observers_are_refused(changes: dict[str, object], message: str) -> None:

@@ -1,14 +1,21 @@
 """Distance summation, the last box of Fig. 2: Quick's vector sum over channels and levels."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torch_vdm.charging import Charge
+from torch_vdm.grid import NONE, Before
 from torch_vdm.quadtree import push
 
 # A difference over this is visible, in JND: the unit's definition.
 VISIBLE = 1.0
+
+# A difference counts for no more, in JND, so that its power of 6 stays finite in float32. Light has
+# no such differences; values below 0 may. Status: choice.
+LARGEST_DIFFERENCE = 1e5
 
 # Below this the power of a difference is 0 in float32. Status: choice.
 SMALLEST_DIFFERENCE = 1e-30
@@ -44,12 +51,30 @@ def local_visual_difference_of_energy(energy: Tensor, count: float, exponent: Te
 
     Arguments as `local_visual_difference`, whose square ``energy`` is the sum over ``count`` of.
     """
+    energy = energy.clamp_max(LARGEST_DIFFERENCE**2 * count)
     rest = torch.exp2((0.5 * exponent - 1.0) * torch.log2(energy.clamp_min(SMALLEST_DIFFERENCE)))
     # Divided when there is one plane left.
     return (energy * rest).sum((1, 2)).unsqueeze(1) / count ** (0.5 * exponent)
 
 
-def accumulate(local: Sequence[Tensor], root: Tensor, items: int = 1) -> Tensor:
+class Paths(NamedTuple):
+    """What accumulates down the paths of the quad-tree."""
+
+    local: tuple[Tensor, ...]
+    """One (B, 1, h, w) a level, level 0 (the root) first: what `accumulate` takes."""
+    changes: tuple[Tensor, ...]
+    """The same shapes: how far the means of nodes differ, `torch_vdm.charging.changes`; or none."""
+    root: Tensor
+    """(B, 1, 1, 1), what every path begins with."""
+
+
+def accumulate(
+    local: Sequence[Tensor],
+    root: Tensor,
+    items: int = 1,
+    before: Sequence[Before] = (),
+    charges: Sequence[Charge] | None = None,
+) -> Tensor:
     """Sum the local differences down every path of the quad-tree.
 
     Parameters
@@ -60,6 +85,10 @@ def accumulate(local: Sequence[Tensor], root: Tensor, items: int = 1) -> Tensor:
         (B, 1, 1, 1), what every path begins with: the lowpass term, or 0.
     items
         How many trees lie below one another, root (1, 1, items, 1) and all.
+    before
+        For each level what is put before its first node; nothing by default.
+    charges
+        One a level: what a node is charged. None: every child all that its parent has, as printed.
 
     Returns
     -------
@@ -67,8 +96,13 @@ def accumulate(local: Sequence[Tensor], root: Tensor, items: int = 1) -> Tensor:
         (B, 1, h, w) of the finest level, in JND to the power of the summation.
     """
     total = root
-    for nodes in local:
-        total = nodes + push(total, (nodes.shape[-2], nodes.shape[-1]), items)
+    for level, (nodes, first) in enumerate(zip(local, before or [NONE] * len(local), strict=True)):
+        total = push(total, (nodes.shape[-2], nodes.shape[-1]), items, first)
+        if charges is None:
+            total = nodes + total
+            continue
+        inherited, own = charges[level]
+        total = (nodes if own is None else nodes * own) + total * inherited
     return total
 
 

@@ -14,6 +14,7 @@ from torch.autograd import forward_ad
 
 from torch_vdm.contrast import LARGEST, local_contrast, opponents
 from torch_vdm.distance import SMALLEST_DIFFERENCE
+from torch_vdm.masking import masking_energy
 from torch_vdm.matrix import mix
 from torch_vdm.pooling import pool, surround
 from torch_vdm.response import Sight
@@ -106,7 +107,7 @@ def _slopes(
         _respond(image, matrix, masking, any(slopes))
         for image, slopes in zip((images[:3], images[3:]), wanted_of, strict=True)
     )
-    slope = _by_difference(one.response.sub_(other.response), gradient, summation)
+    slope = _by_difference(one.response - other.response, gradient, summation)
     return [
         *_by_image(images[:3], one, slope, matrix, wanted_of[0]),
         *_by_image(images[3:], other, slope.neg_(), matrix, wanted_of[1]),
@@ -119,8 +120,11 @@ class _Path(NamedTuple):
     response: Tensor
     contrast: Tensor
     opponent: Tensor
-    slope: Tensor
-    """Of the transducer."""
+    weighted: Tensor
+    gain: Tensor
+    """(B, channels, 1, h, w): the response over the weighted contrast."""
+    fall: Tensor | None = None
+    """The same shape: 2 q / (1 + E), how the gain falls with what masks."""
 
 
 def _respond(image: Sequence[Tensor], matrix: Tensor, masking: Tensor, sloping: bool) -> _Path:
@@ -129,24 +133,26 @@ def _respond(image: Sequence[Tensor], matrix: Tensor, masking: Tensor, sloping: 
     contrast = local_contrast(details, scale)
     opponent = opponents(contrast, matrix)
     weighted = opponent * sensitivity
-    energy = weighted.square().add_(1.0)
-    # `signed_transducer`: v g, g = 2^(q (1 - log2(1 + v^2))).
+    energy = masking_energy(weighted).add_(1.0)
+    # `signed_transducer`: v g, g = 2^(q (1 - log2(1 + E))).
     gain = torch.log2(energy).sub_(1.0).mul_(-masking).exp2_()
-    weighted.mul_(gain)
-    if sloping:
-        # g (1 - 2 q v^2 / (1 + v^2)).
-        gain.mul_(energy.reciprocal_().sub_(1.0).mul_(2.0 * masking).add_(1.0))
-    return _Path(weighted, contrast, opponent, gain)
+    if not sloping:
+        return _Path(weighted.mul_(gain), contrast, opponent, weighted, gain)
+    response = weighted * gain
+    return _Path(
+        response, contrast, opponent, weighted, gain, energy.reciprocal_().mul_(2.0 * masking)
+    )
 
 
 def _by_difference(difference: Tensor, gradient: Tensor, summation: Tensor) -> Tensor:
     """Return the slope of the local visual difference by the difference of responses, signed."""
-    pooled = pool(surround(difference.abs()))
-    # That of size^e is e size^(e - 1).
-    slope = torch.log2(pooled.clamp_min(SMALLEST_DIFFERENCE)).mul_(summation - 2.0).exp2_()
-    slope.mul_(pooled).mul_(gradient.unsqueeze(2) * summation)
+    pooled = pool(surround(difference * difference))
+    # That of energy^(e / 2) is e / 2 energy^(e / 2 - 1), and that of the energy twice the root.
+    half = 0.5 * summation
+    slope = torch.log2(pooled.clamp_min(SMALLEST_DIFFERENCE)).mul_(half - 1.0).exp2_()
+    slope.mul_(gradient.unsqueeze(2) * summation)
     # With its repeated border the box is its own transpose.
-    return pool(surround(slope)).mul_(difference.sign_())
+    return pool(surround(slope)).mul_(difference)
 
 
 def _by_image(
@@ -163,7 +169,10 @@ def _by_image(
     if not any(wanted):
         return None, None, None
     details, scale, sensitivity = image
-    by_weighted = path.slope.mul_(slope)
+    assert path.fall is not None
+    # d R_o / d v_p = g (o = p) - 2 q / (1 + E) v_p R_o.
+    hidden = (slope * path.response).sum(2, keepdim=True).mul_(path.fall)
+    by_weighted = (slope * path.gain).sub_(path.weighted.mul_(hidden))
     by_sensitivity = None
     if wanted[2]:
         by_sensitivity = path.opponent.mul_(by_weighted).sum_to_size(sensitivity.shape)

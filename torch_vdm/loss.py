@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_vdm.display import Display
+from torch_vdm.distance import just_noticeable
 from torch_vdm.observer import Observer
 from torch_vdm.pair import has_values
 from torch_vdm.vdm import VDM
@@ -26,11 +27,16 @@ L1 = 240.0
 DARK_LIGHT = 0.2
 
 
+# The power of the map whose logarithm is the loss: smooth at 0, and about even up to 1 JND. Status:
+# choice, that of Eq. 5.
+EXPONENT = 2.4
+
+
 class VDMLoss(nn.Module):
     """A perceptual loss: the mean of log(1 + p), and an L1 term.
 
-    p is the map of `VDM` to the power of 2.4, before its root: smooth, 0 with gradient 0 where the
-    images are equal. The logarithm keeps far-off regions from drowning the rest: near threshold
+    p is the map of `VDM` to the power of 2.4: smooth, 0 with gradient 0 where the images are equal.
+    The logarithm keeps far-off regions from drowning the rest: near threshold
     the loss orders images as the map does, far from it it grows with the logarithm of the JND.
 
     The L1 term is the mean absolute difference of sRGB-coded values (of light over the display's
@@ -88,7 +94,9 @@ class VDMLoss(nn.Module):
         test, reference, seen = self.metric._checked(test, reference)
         # The L1 term first: what it needs on the way is gone when the metric needs most.
         l1 = self.l1 * self.metric._in_rows(self._absolute, test, reference) if self.l1 else 0.0
-        plane = torch.log1p(self.metric._power(test, reference, seen)) + l1
+        power = self.metric._power(test, reference, seen)
+        exponent = self.metric.observer.summation_exponent / EXPONENT
+        plane = torch.log1p(just_noticeable(power, power.new_tensor(exponent))) + l1
         items = _mean(plane, mask)
         if self.reduction == "mean":
             return items.mean()

@@ -12,6 +12,7 @@ from torch.utils.checkpoint import checkpoint
 from torch_vdm.display import Display
 from torch_vdm.distance import just_noticeable
 from torch_vdm.fast import for_any_size
+from torch_vdm.grid import Grid
 from torch_vdm.memory import keep_freed_memory
 
 Nonfinite = Literal["raise", "mask"]
@@ -70,8 +71,11 @@ class PairMetric(nn.Module):
         del size
         return 1
 
-    def _to_pixels(self, plane: Tensor, size: tuple[int, int]) -> Tensor:
-        """Return a plane of `_accumulated`, or of its root, at the pixels of the images."""
+    def _to_pixels(self, plane: Tensor, size: tuple[int, int], grid: Grid | None = None) -> Tensor:
+        """Return a plane of `_accumulated`, or of its root, at the pixels of the images.
+
+        ``grid``: that of a part of an image.
+        """
         raise NotImplementedError
 
     def _apply(self, fn: Any, recurse: bool = True) -> Self:
@@ -116,7 +120,9 @@ class PairMetric(nn.Module):
         return masked(self._to_pixels(jnd, (test.shape[-2], test.shape[-1])), seen)
 
     def power(self, test: Tensor, reference: Tensor) -> Tensor:
-        """Return the accumulated differences before the root: the map to the power of 2.4.
+        """Return the accumulated differences before the root, the map to a power.
+
+        That of the summation: 2.4 for the paper's observer, 6 for the calibrated one.
 
         (B, 1, H, W), from (B, 3, H, W) twice. Smooth where the images are equal, so that a loss
         is taken from here; see `VDMLoss`.

@@ -73,18 +73,3 @@ def pool_halves(surrounded: Tensor, nodes: int, dim: int) -> Tensor:
 def covering(nodes: int) -> float:
     """Return how many nodes `pool_halves` adds up for the half of a node, in x and in y."""
     return float((2 * nodes) ** 2)
-
-
-def glance(nodes: Tensor, window: int, shifts: int) -> Tensor:
-    """Return around every node the sum that one glance takes in.
-
-    ``nodes`` is (B, 1, h, w), with ``shifts`` nodes in the width of one. The weight falls linearly
-    from 1 to 0 over ``window`` nodes to each side, an odd number: as many cycles of a level,
-    whatever its frequency, because the eye's resolution falls as fast off its centre.
-    """
-    side = window * shifts // 2 * 2 + 1
-    # A box twice is a triangle; what lies outside the plane after the first is still needed.
-    nodes = functional.pad(nodes, (side - 1,) * 4)
-    for _ in range(2):
-        nodes = functional.avg_pool2d(nodes, side, 1)
-    return nodes * float(side * side)

@@ -46,7 +46,7 @@ class Comparison:
     """The figures of one comparison; the fields of the JSON file.
 
     JND figures are of the map: its maximum and where it is (x, y), mean and 95th percentile, and
-    the share of pixels over 1 JND. ``score_jnd`` takes the image as one stimulus.
+    the share of pixels over 1 JND. ``score_jnd`` is that of `VDM.score`, the maximum again.
     ``mean_luminance_change`` is relative to the reference: -0.1 is 10 % darker; None against a
     black reference. ``seconds`` is the metric's own time.
     """
@@ -72,13 +72,8 @@ class Comparison:
     def verdict(self) -> str:
         """Return one line: whether anybody can see the difference, at this distance."""
         where = f"at {self.ppd:g} pixels per degree"
-        if max(self.max_jnd, self.score_jnd) <= VISIBLE:
-            return f"Nobody will see a difference {where}: it stays under 1 JND everywhere."
         if self.max_jnd <= VISIBLE:
-            return (
-                f"Hardly visible {where}: under 1 JND at every single place, but the image as a "
-                f"whole may be told apart ({self.score_jnd:.1f} JND)."
-            )
+            return f"Nobody will see a difference {where}: it stays under 1 JND everywhere."
         x, y = self.max_pixel
         share = f"{self.visible_fraction:.1%}" if self.visible_fraction >= 5e-4 else "under 0.1%"
         return (
@@ -179,7 +174,6 @@ def table(comparison: Comparison, luminances: tuple[float, float]) -> "Renderabl
         ("mean", f"{comparison.mean_jnd:.2f} JND", ""),
         ("95th percentile", f"{comparison.p95_jnd:.2f} JND", ""),
         ("visible pixels", f"{comparison.visible_fraction:.1%}", "over 1 JND"),
-        ("detection score", f"{comparison.score_jnd:.2f} JND", "the image as one stimulus"),
         (
             "mean luminance",
             f"{luminances[0]:.4g} to {luminances[1]:.4g} cd/m2",

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from torch_vdm.contrast import adapted, local_contrast, opponents
 from torch_vdm.csf import bandpass
-from torch_vdm.masking import energy_transducer, signed_transducer
+from torch_vdm.grid import NONE, Before
+from torch_vdm.masking import energy_transducer, masking_energy, signed_transducer
 from torch_vdm.matrix import mix
 from torch_vdm.quadtree import push
 
@@ -96,11 +97,12 @@ class Sight(NamedTuple):
     """(B, channels, orientations, h, w): the contrast sensitivity of each channel, or one
     orientation or node of it where all have the same."""
 
-    def pushed(self, size: tuple[int, int], items: int = 1) -> "Sight":
-        """Return what is given at the parents at their children, on a plane of ``size``."""
+    def pushed(self, size: tuple[int, int], items: int = 1, before: Before = NONE) -> "Sight":
+        """Return what is given at the parents at their children, as `push` takes them."""
         shared = self.sensitivity.shape[-2:] == (1, 1)
-        sensitivity = self.sensitivity if shared else push(self.sensitivity, size, items)
-        return Sight(None if self.scale is None else push(self.scale, size, items), sensitivity)
+        children = size, items, before
+        sensitivity = self.sensitivity if shared else push(self.sensitivity, *children)
+        return Sight(None if self.scale is None else push(self.scale, *children), sensitivity)
 
     def of(self, orientations: slice) -> "Sight":
         """Return the sight of some orientations."""
@@ -116,7 +118,6 @@ def response(
     exponent: Tensor,
     signed: bool,
     masking: bool,
-    phases: int,
 ) -> Tensor:
     """Return the responses of one level of one image: local contrast to the transducer."""
     contrast = details
@@ -124,7 +125,9 @@ def response(
         contrast = opponents(local_contrast(details, sight.scale), matrix)
     weighted = contrast * sight.sensitivity
     if signed:
-        return signed_transducer(weighted, exponent, phases) if masking else weighted
+        if not masking:
+            return weighted
+        return signed_transducer(weighted, exponent, masking_energy(weighted))
     return energy_transducer(weighted * weighted) if masking else weighted.abs()
 
 
@@ -137,17 +140,14 @@ def response_difference(
     exponent: Tensor,
     signed: bool,
     masking: bool,
-    phases: int,
-    absolute: bool,
 ) -> Tensor:
-    """Return the difference of two images' responses at a level, if wanted ``absolute``.
+    """Return the difference of two images' responses at a level.
 
     Each image by itself: equal images then take equal paths through the vectorised loops, and
     their difference is exactly 0.
     """
-    options = matrix, exponent, signed, masking, phases
-    difference = response(details, sight, *options) - response(other_details, other_sight, *options)
-    return difference.abs() if absolute else difference
+    options = matrix, exponent, signed, masking
+    return response(details, sight, *options) - response(other_details, other_sight, *options)
 
 
 def response_difference_at(

@@ -18,6 +18,7 @@ from torch_vdm.csf import barten
 from torch_vdm.display import BT709_TO_XYZ, Display
 from torch_vdm.distance import local_visual_difference
 from torch_vdm.fast import SMALLEST, step
+from torch_vdm.grid import Grid
 from torch_vdm.masking import energy_transducer
 from torch_vdm.pair import Nonfinite, PairMetric
 
@@ -199,7 +200,12 @@ class Sarnoff(PairMetric):
             planes.append(reduce(planes[-1], self._fast))
         return planes
 
-    def _to_pixels(self, plane: Tensor, size: tuple[int, int]) -> Tensor:
+    def _to_pixels(
+        self,
+        plane: Tensor,
+        size: tuple[int, int],
+        grid: Grid | None = None,  # noqa: ARG002  # there are no parts
+    ) -> Tensor:
         if not self.resample or plane.shape[-2:] == size:
             return plane
         # Linear, for the map must not fall below 0.

@@ -9,9 +9,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_vdm.charging import AROUND, Charge
 from torch_vdm.cortex import Cortex, Transform, bands
+from torch_vdm.cortex.haar import lowpass_of_light
 from torch_vdm.cortex.transform import Base
-from torch_vdm.distance import accumulate, just_noticeable
+from torch_vdm.distance import Paths, accumulate, just_noticeable
+from torch_vdm.grid import Before, Grid
 from torch_vdm.observer import Observer
 from torch_vdm.pair import PairMetric, masked
 from torch_vdm.tiling import (
@@ -28,16 +31,13 @@ from torch_vdm.tiling import (
 # Called with how many steps are done, and of how many.
 Progress = Callable[[int, int], None]
 
-# What every node of two representations adds to its paths, level 0 first, and what the paths begin
-# with.
-Paths = Callable[[Cortex, Cortex], tuple[Sequence[Tensor], Tensor]]
-
 
 class _Done(NamedTuple):
     """A tile, and what has accumulated down the paths to its leaves, (1, 1, h, w)."""
 
     item: int
     part: Slices
+    grid: Grid
     total: Tensor
     seen: Tensor | None
 
@@ -68,8 +68,17 @@ class TiledMetric(PairMetric):
         """Return the cone responses to an image."""
         raise NotImplementedError
 
-    def _decomposed(self, planes: Tensor, coarser: Tensor | None = None) -> Cortex:
-        """Return the cortex representation of cone planes; ``coarser`` as `_filtered`."""
+    def _decomposed(
+        self,
+        planes: Tensor,
+        coarser: Tensor | None = None,
+        part: Slices | None = None,
+        grid: Grid | None = None,
+    ) -> Cortex:
+        """Return the cortex representation of cone planes; ``coarser`` as `_filtered`.
+
+        Of a ``part`` of them, whose nodes lie as ``grid`` says, or of all.
+        """
         raise NotImplementedError
 
     def _filtered(self, planes: Tensor, coarser: Tensor | None = None, finest: int = 0) -> Tensor:
@@ -81,16 +90,16 @@ class TiledMetric(PairMetric):
         """
         raise NotImplementedError
 
-    def _differences(self, first: Cortex, second: Cortex) -> tuple[Sequence[Tensor], Tensor]:
-        """Return the paths of the map."""
+    def _differences(self, first: Cortex, second: Cortex) -> Paths:
+        """Return what the map is accumulated from."""
         raise NotImplementedError
 
-    def _glances(self, first: Cortex, second: Cortex) -> tuple[Sequence[Tensor], Tensor]:
-        """Return the paths of the detection score."""
+    def _descended(self, paths: Paths, before: Sequence[Before]) -> Tensor:
+        """Return what has accumulated at the leaves, (B, 1, h, w); ``before`` as `accumulate`."""
         raise NotImplementedError
 
-    def _detected(self, most: Tensor) -> Tensor:
-        """Return the score of what the largest leaf of each item has accumulated, (B,)."""
+    def _charges(self, changes: Sequence[Tensor]) -> list[Charge] | None:
+        """Return what the nodes of each level are charged; None: all."""
         raise NotImplementedError
 
     @torch.no_grad()
@@ -144,14 +153,8 @@ class TiledMetric(PairMetric):
                 f"got {tuple(out.shape)}, {out.dtype}"
             )
         planes = out.view(items, *size)
-        # What spatial pooling needs around a node.
-        pooled = 2 * self.transform.shifts - 1
-        for item, part, total, seen in self._in_tiles(
-            test, reference, tile, pooled, self._differences, progress
-        ):
-            exponent = self.summation_exponent.to(total.dtype)
-            jnd = self._to_pixels(just_noticeable(total, exponent), _size(part))
-            planes[item, part[0], part[1]] = masked(jnd, seen)[0, 0].to(out)
+        for item, part, grid, total, seen in self._in_tiles(test, reference, tile, progress):
+            planes[item, part[0], part[1]] = self._jnd(total, part, grid, seen).to(out)
         return out
 
     @torch.no_grad()
@@ -162,42 +165,41 @@ class TiledMetric(PairMetric):
         tile: int = TILE,
         progress: Progress | None = None,
     ) -> Tensor:
-        """Return the detection score (B,) of images that may be larger than memory.
+        """Return the largest value of each item's map, (B,), JND, and keep no map.
 
-        That of the whole images, to rounding; arguments as `tiled`. Halos are wider, for a glance
-        takes in many nodes.
+        That of the whole images, to rounding; arguments as `tiled`.
         """
         items, _ = check_sources(test, reference)
-        glanced = self.transform.shifts * (self.observer.score_window + 1)
         largest: list[list[Tensor]] = [[] for _ in range(items)]
-        for item, _, total, _ in self._in_tiles(
-            test, reference, tile, glanced, self._glances, progress
-        ):
-            largest[item].append(total.amax())
-        return self._detected(torch.stack([torch.stack(of_item).amax() for of_item in largest]))
+        for item, part, grid, total, seen in self._in_tiles(test, reference, tile, progress):
+            largest[item].append(self._jnd(total, part, grid, seen).amax())
+        return torch.stack([torch.stack(of_item).amax() for of_item in largest])
+
+    def _jnd(self, total: Tensor, part: Slices, grid: Grid, seen: Tensor | None) -> Tensor:
+        """Return the map (h, w) of a tile."""
+        exponent = self.summation_exponent.to(total.dtype)
+        jnd = self._to_pixels(just_noticeable(total, exponent), _size(part), grid)
+        return masked(jnd, seen)[0, 0]
 
     def _in_tiles(
         self,
         test: Source,
         reference: Source,
         side: int,
-        nodes: int,
-        paths: Paths,
         progress: Progress | None,
     ) -> Iterator[_Done]:
-        """Yield what accumulates down the paths to the leaves of every tile.
-
-        ``nodes``: how many nodes around a node ``paths`` takes in.
-        """
+        """Yield what accumulates down the paths to the leaves of every tile."""
         items, size = check_sources(test, reference)
         shifts = self.transform.shifts
-        tiling = Tiling.fit(size, side, shifts, self.transform.reach + nodes)
+        # Spatial pooling takes in fewer nodes than charging does.
+        nodes = self.transform.reach + AROUND * shifts
+        grid = self.transform.grid(size, self.observer.true_means)
+        tiling = Tiling.fit(size, side, shifts, nodes, grid)
         filtered = self.transform.csf == "filter" and not tiling.whole
-        if filtered:
-            tiling = tiling.wider(bands.halo(_scales(tiling)))
+        plain = tiling.plain(bands.halo(_scales(tiling)))
         device = self.summation_exponent.device
         steps = count(1)
-        all_steps = items * len(tiling) * (1 if tiling.whole else 2 + filtered)
+        passes = len(tiling) * (1 if tiling.whole else 2) + filtered * len(plain)
 
         def images(item: int, part: Slices) -> _Pair:
             one, other = (read(source, item, part).to(device) for source in (test, reference))
@@ -206,29 +208,51 @@ class TiledMetric(PairMetric):
 
         def step() -> None:
             if progress is not None:
-                progress(next(steps), all_steps)
+                progress(next(steps), items * passes)
 
         for item in range(items):
             read_part = partial(images, item)
             contrasts: list[Tensor] | None = None
             coarse = None
             if filtered:
-                contrasts = self._coarse_contrasts(read_part, tiling, step)
+                contrasts = self._coarse_contrasts(read_part, plain, step)
             if not tiling.whole:
                 representations = self._coarse(read_part, tiling, contrasts, step)
-                coarse = accumulate(*paths(*representations))
+                before = representations[0].before
+                coarse = self._descended(self._differences(*representations), before)
             for tile in tiling:
-                planes, seen = read_part(tile.around)
                 around = _around(tile, tiling, contrasts)
-                first, second = map(self._decomposed, planes, around)
-                local, total = paths(first, second)
-                if coarse is not None:
-                    fine = enumerate(reversed(local[-tiling.levels :]))
-                    local = [cut(plane, tile.within(2 ** (k + 1) // shifts)) for k, plane in fine]
-                    local.reverse()
-                    total = cut(coarse, tile.of_image(2 ** (tiling.levels + 1) // shifts))
-                    seen = None if seen is None else cut(seen, tile.within(1))
-                yield _Done(item, tile.part, accumulate(local, total), seen)
+                planes, seen = read_part(around.part)
+                first, second = (
+                    self._decomposed(cones, contrast, around.inner, tiling.grid_of(tile.around))
+                    for cones, contrast in zip(planes, around.contrasts, strict=True)
+                )
+                paths = self._differences(first, second)
+                part_grid = tiling.grid_of(tile.part)
+                if coarse is None:
+                    total = self._descended(paths, first.before)
+                    yield _Done(item, tile.part, part_grid, total, seen)
+                    step()
+                    continue
+                places = [
+                    tile.within(2 ** (level + 1) // shifts) for level in range(tiling.levels)
+                ][::-1]
+                fine = slice(-tiling.levels, None)
+                local = list(map(cut, paths.local[fine], places))
+                charges = self._charges(paths.changes[fine])
+                if charges is not None:
+                    charges = [
+                        Charge(
+                            cut(charge.inherited, place),
+                            None if charge.own is None else cut(charge.own, place),
+                        )
+                        for charge, place in zip(charges, places, strict=True)
+                    ]
+                total = cut(coarse, tile.of_image(2 ** (tiling.levels + 1) // shifts))
+                seen = None if seen is None else cut(seen, around.pixels)
+                before = part_grid.down(len(local))
+                total = accumulate(local, total, before=before, charges=charges)
+                yield _Done(item, tile.part, part_grid, total, seen)
                 step()
 
     def _coarse_contrasts(
@@ -254,24 +278,37 @@ class TiledMetric(PairMetric):
         """Return the levels of both images that are coarser than those of tiles."""
         octaves = tiling.levels - 1
         options = self._fast, self.observer.true_means
-        # For each image: the tiles of its lowpass pyramid, and the sum of its pixels.
+        filtered = contrasts is not None
+        # For each image: the tiles of its lowpass pyramid, those of its light's, and the sum of
+        # its pixels.
         planes: tuple[list[Tensor], list[Tensor]] = [], []
+        lights: tuple[list[Tensor], list[Tensor]] = [], []
         sums = [torch.zeros(1, 1, 1, 1, dtype=torch.float64)] * 2
         for tile in tiling:
             around = _around(tile, tiling, contrasts)
-            for number, cones in enumerate(images(tile.around).planes):
-                source = self._filtered(cones, around[number])
-                reduced = self.transform.reduced(source, octaves, *options)
+            grid = tiling.grid_of(tile.around)
+            for number, cones in enumerate(images(around.part).planes):
+                source = self._filtered(cones, around.contrasts[number])
+                source = source if around.inner is None else cut(source, around.inner)
+                reduced = self.transform.reduced(source, octaves, *options, grid=grid)
                 planes[number].append(cut(reduced, tile.within(2**octaves)))
-                inside = cut(cones, tile.within(1)).double().sum((-2, -1), keepdim=True)
+                if filtered:
+                    inner = cones if around.inner is None else cut(cones, around.inner)
+                    reduced = self.transform.reduced(inner, octaves, *options, grid=grid)
+                    lights[number].append(cut(reduced, tile.within(2**octaves)))
+                inside = cut(cones, around.pixels).double().sum((-2, -1), keepdim=True)
                 sums[number] = sums[number].to(inside) + inside
             step()
         pixels = math.prod(tiling.size)
         coarse = []
-        for tiles, total in zip(planes, sums, strict=True):
+        for tiles, of_light, total in zip(planes, lights, sums, strict=True):
             plane = tiling.joined(tiles)
             base = Base(plane, octaves, tiling.size, (total / pixels).to(plane))
-            coarse.append(self.transform.resume(base, *options))
+            cortex = self.transform.resume(base, *options)
+            if filtered:
+                base = base._replace(plane=tiling.joined(of_light))
+                cortex = lowpass_of_light(cortex, base, self.observer.true_means)
+            coarse.append(cortex)
         return coarse
 
 
@@ -280,14 +317,30 @@ def _scales(tiling: Tiling) -> int:
     return max(tiling.levels - 2, 1)
 
 
-def _around(
-    tile: Tile, tiling: Tiling, contrasts: list[Tensor] | None
-) -> list[Tensor] | list[None]:
-    """Return what `_coarse_contrasts` gives around a tile, for each image."""
+class _Around(NamedTuple):
+    """What a tile is computed from."""
+
+    part: Slices
+    """What is read: the tile with its halo, and of a filtered image with what its filter needs."""
+    inner: Slices | None
+    """Where in it lie the tile and its halo, if that is not all."""
+    pixels: Slices
+    """Where in it lie the tile's own pixels."""
+    contrasts: list[Tensor] | list[None]
+    """What `_coarse_contrasts` gives there, for each image."""
+
+
+def _around(tile: Tile, tiling: Tiling, contrasts: list[Tensor] | None) -> _Around:
+    """Return what a tile is computed from, where ``contrasts`` are those of the whole images."""
     if contrasts is None:
-        return [None, None]
-    whole = Tile(tile.around, tile.around)
-    return [cut(contrast, whole.of_image(2 ** _scales(tiling))) for contrast in contrasts]
+        return _Around(tile.around, None, tile.within(1), [None, None])
+    # Wherever the nodes lie, a filter's samples lie where those of the paper's grid do.
+    scales = _scales(tiling)
+    wide = tiling.wider(tile, bands.halo(scales))
+    whole = Tile(wide.around, wide.around)
+    coarser = [cut(contrast, whole.of_image(2**scales)) for contrast in contrasts]
+    pixels = Tile(tile.part, wide.around).within(1)
+    return _Around(wide.around, wide.within(1), pixels, coarser)
 
 
 def _size(part: Slices) -> tuple[int, int]:

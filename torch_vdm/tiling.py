@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torch_vdm.grid import PAPERS, Grid
+
 # Pixels a side of a tile. Status: choice; 1024 takes half a gigabyte with `Haar`.
 TILE = 1024
 
@@ -46,22 +48,27 @@ class Tile(NamedTuple):
     """Rows and columns of the image."""
     around: Slices
     """The same with its halo, as far as the image goes."""
+    grid: Grid = PAPERS
+    """Where the nodes lie on the image."""
 
     def within(self, node: int) -> Slices:
         """Return where the part lies on a plane of ``around`` with nodes of ``node`` pixels."""
-        return _scaled(self.part, node, (self.around[0].start, self.around[1].start))
+        return self._scaled(node, (self.around[0].start, self.around[1].start))
 
     def of_image(self, node: int) -> Slices:
         """Return where the part lies on a plane of the image with nodes of ``node`` pixels."""
-        return _scaled(self.part, node, (0, 0))
+        return self._scaled(node, (0, 0))
 
-
-def _scaled(part: Slices, node: int, origin: tuple[int, int]) -> Slices:
-    rows, columns = (
-        slice((side.start - begin) // node, -(-(side.stop - begin) // node))
-        for side, begin in zip(part, origin, strict=True)
-    )
-    return rows, columns
+    def _scaled(self, node: int, origin: tuple[int, int]) -> Slices:
+        offsets = self.grid.offset(node.bit_length() - 1)
+        rows, columns = (
+            slice(
+                (side.start + offset) // node - (begin + offset) // node,
+                -(-(side.stop + offset) // node) - (begin + offset) // node,
+            )
+            for side, begin, offset in zip(self.part, origin, offsets, strict=True)
+        )
+        return rows, columns
 
 
 @dataclass(frozen=True)
@@ -79,21 +86,26 @@ class Tiling:
         image's lowpass pyramid.
     halo
         Pixels that a tile is computed with beyond each of its sides.
+    grid
+        Where the nodes lie on the image.
     """
 
     size: tuple[int, int]
     sides: tuple[int, int]
     levels: int
     halo: int
+    grid: Grid = PAPERS
 
     @classmethod
-    def fit(cls, size: tuple[int, int], tile: int, shifts: int, nodes: int) -> "Tiling":
+    def fit(
+        cls, size: tuple[int, int], tile: int, shifts: int, nodes: int, grid: Grid = PAPERS
+    ) -> "Tiling":
         """Return a tiling of an image of ``size`` with tiles of at most ``tile`` pixels a side.
 
         The levels of tiles have ``shifts`` nodes in the width of one, and need ``nodes`` nodes
         around each. There are as few as leave a plane no larger than a tile to the others: the halo
-        doubles with every level. Tiles and halos begin where the coarsest one's parents do, so that
-        the levels of a tile are a part of the image's.
+        doubles with every level. Tiles and halos begin where the coarsest one's parents do, which
+        ``grid`` says, so that the levels of a tile are a part of the image's.
         """
         if not (isinstance(tile, int) and tile >= SMALLEST_TILE):
             raise ValueError(
@@ -104,26 +116,56 @@ class Tiling:
         parent = 2 ** (levels + 1)
         halo = -(-nodes // (2 * shifts)) * parent
         side = tile // parent * parent
-        return cls(size, (side, side), levels, halo)
+        return cls(size, (side, side), levels, halo, grid)
 
     @classmethod
     def strips(
-        cls, size: tuple[int, int], pixels: int, levels: int, shifts: int, nodes: int
+        cls,
+        size: tuple[int, int],
+        pixels: int,
+        levels: int,
+        shifts: int,
+        nodes: int,
+        grid: Grid = PAPERS,
     ) -> "Tiling":
         """Return a tiling by strips as wide as the image, of about as many pixels.
 
-        ``levels``, ``shifts`` and ``nodes`` as in `fit`.
+        ``levels``, ``shifts``, ``nodes`` and ``grid`` as in `fit`.
         """
         parent = 2 ** (levels + 1)
         halo = -(-nodes // (2 * shifts)) * parent
         # No thinner than so many halos, which are computed twice.
         rows = max(pixels // (size[1] * parent) * parent, 4 * halo)
-        return cls(size, (rows, size[1]), levels, halo)
+        return cls(size, (rows, size[1]), levels, halo, grid)
 
-    def wider(self, pixels: int) -> "Tiling":
-        """Return the tiling with halos that are wider by so many pixels, or a few more."""
+    def plain(self, pixels: int) -> "Tiling":
+        """Return the tiling of the paper's grid, with halos wider by so many pixels or a few more.
+
+        Its tiles begin at multiples of what is a node of any level of theirs.
+        """
         parent = 2 ** (self.levels + 1)
-        return replace(self, halo=self.halo + -(-pixels // parent) * parent)
+        return replace(self, halo=self.halo + -(-pixels // parent) * parent, grid=PAPERS)
+
+    def wider(self, tile: Tile, pixels: int) -> Tile:
+        """Return all around a tile as a part, and around it so many pixels or a few more.
+
+        These begin and end where tiles of `plain` may.
+        """
+        parent = 2 ** (self.levels + 1)
+        rows, columns = (
+            slice(
+                max((side.start - pixels) // parent * parent, 0),
+                min(-(-(side.stop + pixels) // parent) * parent, length),
+            )
+            for side, length in zip(tile.around, self.size, strict=True)
+        )
+        return Tile(tile.around, (rows, columns))
+
+    def grid_of(self, part: Slices) -> Grid:
+        """Return the grid of a part that begins as tiles do, for their levels."""
+        if self.whole:
+            return self.grid
+        return self.grid.part((part[0].start, part[1].start), self.levels + 1)
 
     def joined(self, parts: Sequence[Tensor]) -> Tensor:
         """Return the plane of the image of one part (B, C, h, w) a tile, row by row."""
@@ -150,22 +192,28 @@ class Tiling:
     @property
     def across(self) -> int:
         """The number of tiles in a row."""
-        return -(-self.size[1] // self.sides[1])
+        return len(self._parts(1))
 
     def __len__(self) -> int:
         """Return the number of tiles."""
-        return self.across * -(-self.size[0] // self.sides[0])
+        return self.across * len(self._parts(0))
 
     def __iter__(self) -> Iterator[Tile]:
         """Yield the tiles, row by row."""
-        (height, width), (most_rows, most_columns) = self.size, self.sides
-        for top in range(0, height, most_rows):
-            rows = slice(top, min(top + most_rows, height))
-            for left in range(0, width, most_columns):
-                columns = slice(left, min(left + most_columns, width))
-                yield Tile(
-                    (rows, columns), (self._wider(rows, height), self._wider(columns, width))
-                )
+        height, width = self.size
+        for rows in self._parts(0):
+            for columns in self._parts(1):
+                around = self._wider(rows, height), self._wider(columns, width)
+                yield Tile((rows, columns), around, self.grid)
+
+    def _parts(self, axis: int) -> list[slice]:
+        """Return where tiles begin and end along a side: one that is no longer is not cut."""
+        length, most = self.size[axis], self.sides[axis]
+        if length <= most:
+            return [slice(0, length)]
+        offset = self.grid.offset(self.levels + 1)[axis]
+        edges = [0, *range(most - offset, length, most), length]
+        return [slice(begin, end) for begin, end in pairwise(edges)]
 
     def _wider(self, side: slice, length: int) -> slice:
         return slice(max(side.start - self.halo, 0), min(side.stop + self.halo, length))

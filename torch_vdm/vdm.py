@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torch_vdm.aberration import attenuation
+from torch_vdm.charging import Charge, changes, charge
 from torch_vdm.cones import XYZ_TO_SML, cone_responses
 from torch_vdm.contrast import (
     SML_TO_OPPONENTS,
@@ -20,24 +21,26 @@ from torch_vdm.contrast import (
     weber_contrast,
 )
 from torch_vdm.cortex import DEEPEST, Cortex, Haar, Transform, bands
+from torch_vdm.cortex.haar import lowpass_of_light
 from torch_vdm.cortex.transform import Base, mean_of
 from torch_vdm.csf import barten, butterworth
 from torch_vdm.display import BT709_TO_XYZ, Display, linear_values
 from torch_vdm.distance import (
+    LARGEST_DIFFERENCE,
+    Paths,
     accumulate,
-    just_noticeable,
     local_visual_difference,
     local_visual_difference_of_energy,
 )
 from torch_vdm.effects import Effects
 from torch_vdm.fast import SMALLEST, compiled, step
 from torch_vdm.gradient import by_hand, local_difference
+from torch_vdm.grid import Before, Grid
 from torch_vdm.matrix import mix_row, product
 from torch_vdm.observer import Observer
 from torch_vdm.pair import Nonfinite
 from torch_vdm.pooling import (
     covering,
-    glance,
     phase_energy,
     pool,
     pool_halves,
@@ -60,7 +63,7 @@ from torch_vdm.response import (
 )
 from torch_vdm.sarnoff import Sarnoff
 from torch_vdm.tiled import TiledMetric
-from torch_vdm.tiling import Tile, Tiling, cut
+from torch_vdm.tiling import Slices, Tile, Tiling, cut
 
 # Planes with more numbers are computed in parts. Status: choice, measured.
 LARGEST_AT_ONCE = 2**18
@@ -79,10 +82,6 @@ FEW_NODES = 64 * 64
 # Where the weights of a filter's bands are worked out, log2 cd/m2, and between them interpolated:
 # sensitivities change by less than 3 dB from one to the next. Status: choice.
 LUMINANCES = tuple(range(-8, 18))
-
-# A difference counts in the detection score for at most the largest number of its precision to this
-# power, so that its own fourth power, summed, stays finite: 5e7 in float32. Status: choice.
-LARGEST_SCORED = 0.2
 
 # A Butterworth filter's parameters.
 FILTER = ("gain", "cutoff", "order")
@@ -105,7 +104,8 @@ class VDM(TiledMetric):
     display
         What the pixel values are; `Display.srgb()` by default.
     observer
-        Who looks; `Observer.calibrated()` by default.
+        Who looks; `Observer.calibrated()` by default, and that one with what was fitted with the
+        transform.
     transform
         How the image is decomposed: `Haar()`, the default, `StationaryHaar()` or `Steerable()`.
     effects
@@ -138,8 +138,8 @@ class VDM(TiledMetric):
         ):
             if not isinstance(option, kind | None):
                 raise ValueError(f"expected {name}: {kind.__name__}, got {option!r}")
-        self.observer = observer or Observer.calibrated()
         self.transform = transform or Haar()
+        self.observer = (observer or Observer.calibrated()).fitted_to(self.transform)
         self.effects = effects or Effects()
 
         peaks = [self.transform.peaks(level) for level in range(DEEPEST)]
@@ -224,31 +224,38 @@ class VDM(TiledMetric):
         # One level more than are computed, for the parents of the last.
         levels = self._levels(0, count, constants)
         pooled = 2 * shifts - 1
-        tiling = Tiling.strips(size, STRIP, STRIP_LEVELS, shifts, transform.reach + pooled)
+        grid = self._grid(size)
+        tiling = Tiling.strips(size, STRIP, STRIP_LEVELS, shifts, transform.reach + pooled, grid)
         octaves = count - shifts
         filtered = transform.csf == "filter"
-        sources, means = [test, reference], None
+        sources = [test, reference]
         if filtered:  # which needs the image whole
-            cones = [self._cone_planes(image) for image in sources]
-            sources = [self._filtered(planes) for planes in cones]
-            means = [mean_of(planes) for planes in cones]
+            sources = [self._cone_planes(image) for image in sources]
+            sources += [self._filtered(planes) for planes in sources]
 
-        def strip_of(strip: Tile, one: Tensor, other: Tensor) -> list[Tensor]:
+        def strip_of(strip: Tile, *images: Tensor) -> list[Tensor]:
             """Return what the rest needs and rows of two images, and what their levels add."""
             parts: list[Tensor] = []
             strips: list[Cortex] = []
-            for image in (one, other):
-                planes = image if filtered else self._cone_planes(image)
-                cortex, reduced = transform.begin(planes, count, *options)
-                rows = planes.mean(-1, keepdim=True)
-                parts.append(cut(reduced, strip.within(2**octaves)))
+            for image, contrast in zip(images[:2], images[2:] or (None, None), strict=True):
+                light = image if filtered else self._cone_planes(image)
+                rows = light.mean(-1, keepdim=True)
+                planes = light if contrast is None else contrast
+                part = tiling.grid_of(strip.around)
+                cortex, reduced = transform.begin(planes, count, *options, grid=part)
                 parts.append(cut(rows, (strip.within(1)[0], slice(None))))
+                parts.append(cut(reduced, strip.within(2**octaves)))
+                if filtered:
+                    base = Base(light, 0, _size(light), rows)
+                    cortex = lowpass_of_light(cortex, base, self.observer.true_means)
+                    parts.append(cut(cortex.lowpass[shifts - 1], strip.within(2**octaves)))
                 strips.append(cortex)
             for number in range(1, count):
-                level = levels.only(number)
+                level, within = levels.only(number), strip.within(2 ** (count - number) // shifts)
                 local = self._local_difference(strips[0], strips[1], number, level, constants)
-                node = 2 ** (count - number) // shifts
-                parts.append(cut(local, strip.within(node)))
+                parts.append(cut(local, within))
+                if self.observer.charging:
+                    parts.append(cut(self._change(strips[0], strips[1], number), within))
             return parts
 
         pieces = [
@@ -257,76 +264,39 @@ class VDM(TiledMetric):
                 tiling, *(tiling.split_rows(source) for source in sources), strict=True
             )
         ]
-        first_plane, first_rows, second_plane, second_rows, *fine = (
-            torch.cat(parts, -2) for parts in zip(*pieces, strict=True)
+        joined = [torch.cat(parts, -2) for parts in zip(*pieces, strict=True)]
+        each = 3 if filtered else 2
+        coarser: list[Cortex] = []
+        for rows, *planes in (joined[:each], joined[each : 2 * each]):
+            mean = mean_of(rows)
+            bases = [Base(plane, octaves, size, mean) for plane in planes]
+            cortex = transform.rest(bases[0], *options)
+            if filtered:
+                cortex = lowpass_of_light(cortex, bases[1], self.observer.true_means)
+            coarser.append(cortex)
+        paths = self._differences(*coarser)
+        fine = joined[2 * each :]
+        kinds = 2 if self.observer.charging else 1
+        paths = Paths(
+            (*paths.local, *fine[::kinds]),
+            (*paths.changes, *fine[1::kinds]) if kinds == 2 else (),
+            paths.root,
         )
-        first, second = (
-            transform.rest(Base(plane, octaves, size, mean), *options)
-            for plane, mean in zip(
-                (first_plane, second_plane),
-                means or [mean_of(rows) for rows in (first_rows, second_rows)],
-                strict=True,
-            )
-        )
-        coarse, root = self._differences(first, second)
-        return accumulate([*coarse, *fine], root)
+        return self._descended(paths, grid.down(len(paths.local)))
 
-    def _to_pixels(self, plane: Tensor, size: tuple[int, int]) -> Tensor:
-        # The leaves of overlapping nodes are the pixels.
-        return push(plane, size) if self.transform.shifts == 1 else plane
+    def _grid(self, size: tuple[int, int]) -> Grid:
+        return self.transform.grid(size, self.observer.true_means)
+
+    def _to_pixels(self, plane: Tensor, size: tuple[int, int], grid: Grid | None = None) -> Tensor:
+        if self.transform.shifts > 1:  # the leaves of overlapping nodes are the pixels
+            return plane
+        grid = self._grid(size) if grid is None else grid
+        return push(plane, size, before=grid.before(0))
 
     def score(self, test: Tensor, reference: Tensor) -> Tensor:
-        """Return the detection score of each item, (B,), JND: the image as one stimulus.
-
-        A Minkowski sum of the response differences over the coefficients that one glance takes
-        in, at the place where it is largest: a larger stimulus is easier to detect, up to some
-        cycles, where the map stays local.
-        """
-        test, reference, _ = self._checked(test, reference)
-        totals = [
-            accumulate(*self._glances(self.represent(one), self.represent(other))).amax((1, 2, 3))
-            for one, other in self._parts(test, reference)
-        ]
-        return self._detected(torch.cat(totals))
-
-    def _detected(self, most: Tensor) -> Tensor:
-        """Return the score of what the largest leaf of each item has accumulated, (B,)."""
-        constants = self._constants(most.dtype, "score_exponent", "score_coefficients")
-        return just_noticeable(most / constants["score_coefficients"], constants["score_exponent"])
-
-    def _glances(self, first: Cortex, second: Cortex) -> tuple[list[Tensor], Tensor]:
-        """Return what one glance at each node adds to the score, and what every path begins with.
-
-        One (B, 1, h, w) a level, level 0 first, and (B, 1, 1, 1).
-        """
-        dtype = first.mean.dtype
-        constants = self._constants(dtype, "score_exponent", "score_coefficients")
-        exponent = constants["score_exponent"]
-        most = torch.finfo(dtype).max ** LARGEST_SCORED
-        root = self.lowpass_difference(first, second).clamp_max(most) ** exponent
-        glances = [
-            glance(
-                self._scored((seen - expected).clamp(-most, most), exponent),
-                self.observer.score_window,
-                self.transform.shifts,
-            )
-            for seen, expected in zip(self.respond(first), self.respond(second), strict=True)
-        ]
-        return glances, constants["score_coefficients"] * root.sum(1, keepdim=True)
-
-    def _scored(self, difference: Tensor, exponent: Tensor) -> Tensor:
-        """Return what each node of a level adds to the sum of the score, (B, 1, h, w)."""
-        shifts, phases = self.transform.shifts, self.transform.phases
-        if shifts == 1 and phases == 1:
-            return (difference.abs() ** exponent).sum((1, 2)).unsqueeze(1)
-        surrounded = surround_halves(phase_energy(difference, phases), 1)
-        energy = pool_halves(pool_halves(surrounded, 1, -1), 1, -2) / covering(1)
-        # As many coefficients as nodes side by side would have, and for one phase of a grating
-        # its mean power over all: that of abs(cos)^exponent over that of its mean square.
-        half = 0.5 * exponent
-        spread = torch.exp(torch.lgamma(half + 0.5) - torch.lgamma(half + 1.0)) / math.sqrt(math.pi)
-        weight = spread * 2.0**half / shifts**2
-        return weight * (energy**half).sum((1, 2)).unsqueeze(1)
+        """Return the largest value of each item's map, (B,), JND: 1 is just noticeable."""
+        largest: Tensor = self(test, reference).amax((1, 2, 3))
+        return largest
 
     def represent(self, image: Tensor) -> Cortex:
         """Return the cortex representation of an image: display, cones, transform.
@@ -335,10 +305,23 @@ class VDM(TiledMetric):
         """
         return self._decomposed(self._cone_planes(image))
 
-    def _decomposed(self, planes: Tensor, coarser: Tensor | None = None) -> Cortex:
+    def _decomposed(
+        self,
+        planes: Tensor,
+        coarser: Tensor | None = None,
+        part: Slices | None = None,
+        grid: Grid | None = None,
+    ) -> Cortex:
         options = self._fast, self.observer.true_means
-        seen = self.transform.decompose(self._filtered(planes, coarser), *options)
-        return seen if self.transform.csf == "levels" else seen._replace(mean=mean_of(planes))
+        source = self._filtered(planes, coarser)
+        source = source if part is None else cut(source, part)
+        cortex = self.transform.decompose(source, *options, grid=grid)
+        if self.transform.csf == "levels":
+            return cortex
+        mean = mean_of(planes)
+        planes = planes if part is None else cut(planes, part)
+        light = Base(planes, 0, _size(planes), mean)
+        return lowpass_of_light(cortex, light, self.observer.true_means)
 
     def _filtered(self, planes: Tensor, coarser: Tensor | None = None, finest: int = 0) -> Tensor:
         if self.transform.csf == "levels":
@@ -471,9 +454,8 @@ class VDM(TiledMetric):
         levels = self._levels(cortex.finest, len(cortex.details), constants)
         for number, detail in enumerate(cortex.details):
             (sight,) = self._sights(levels.only(number), constants, [cortex], number)
-            responses.append(
-                response(detail, sight.pushed(_size(detail)), *self._options(constants))
-            )
+            pushed = sight.pushed(_size(detail), before=cortex.before[number])
+            responses.append(response(detail, pushed, *self._options(constants)))
         return tuple(responses)
 
     def lowpass_difference(self, first: Cortex, second: Cortex) -> Tensor:
@@ -489,7 +471,8 @@ class VDM(TiledMetric):
         constants = self._constants(one.dtype, "dark_cones", "opponents", "lowpass_gains")
         contrast = weber_contrast(one, other, constants["dark_cones"])
         gains = constants["lowpass_gains"].view(-1, 1, 1)
-        return (opponents(contrast, constants["opponents"]) * gains).abs()
+        weighted = opponents(contrast, constants["opponents"]) * gains
+        return weighted.abs().clamp_max(LARGEST_DIFFERENCE)
 
     def compare(self, first: Cortex, second: Cortex) -> Tensor:
         """Return the accumulated differences of two representations, before the root.
@@ -497,14 +480,15 @@ class VDM(TiledMetric):
         (B, 1, h, w) of the finest level. The responses of a level are taken and dropped one
         level at a time, which bounds memory.
         """
-        return accumulate(*self._differences(first, second), first.items)
+        return self._descended(self._differences(first, second), first.before, first.items)
 
     def beside(self, first: Cortex) -> Callable[[Cortex], Tensor]:
         """Return `compare` with a first representation that stays, whose responses are taken once.
 
         It may stand for a batch of others, (1, ...) beside (B, ...), but not for images below one
         another. Nearly half of the time where many are compared with one; in the last bits other
-        numbers than `compare`.
+        numbers than `compare`. Coarse differences are charged to all pixels below them: where the
+        largest of the map is wanted, of noise that is everywhere, it is the same.
         """
         responses = self.respond(first)
 
@@ -513,18 +497,58 @@ class VDM(TiledMetric):
             exponent = constants["summation_exponent"]
             root = self.lowpass_difference(first, second) ** exponent
             local = tuple(
-                self._gathered((seen - own).abs() if self._absolute else own - seen, exponent)
+                self._gathered(own - seen, exponent)
                 for own, seen in zip(responses, self.respond(second), strict=True)
             )
-            return accumulate(local, root.sum(1, keepdim=True))
+            return accumulate(local, root.sum(1, keepdim=True), before=first.before)
 
         return compare
 
-    def _differences(self, first: Cortex, second: Cortex) -> tuple[tuple[Tensor, ...], Tensor]:
-        """Return what each node adds to the map, and what every path begins with."""
+    def _differences(self, first: Cortex, second: Cortex) -> Paths:
+        """Return what the map is accumulated from."""
         constants = self._constants(first.mean.dtype, "summation_exponent")
         root = self.lowpass_difference(first, second) ** constants["summation_exponent"]
-        return self.local_differences(first, second), root.sum(1, keepdim=True)
+        local = self.local_differences(first, second)
+        return Paths(local, self._changes(first, second), root.sum(1, keepdim=True))
+
+    def _changes(self, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
+        """Return the `changes` of every level, level 0 first; none where nothing is charged."""
+        if not self.observer.charging:
+            return ()
+        few = 0 if self._quartered else _few(first)
+        coarse: list[Tensor] = []
+        if few:
+            rows = changes(*(_in_a_row(cortex.lowpass[:few]) for cortex in (first, second)))
+            coarse = _planes(rows, [_size(detail) for detail in first.details[:few]])
+        fine = range(few, len(first.details))
+        return (*coarse, *(self._change(first, second, number) for number in fine))
+
+    def _change(self, first: Cortex, second: Cortex, number: int) -> Tensor:
+        """Return the `changes` (B, 1, h, w) at the nodes of one level."""
+        one, other = first.lowpass[number], second.lowpass[number]
+        change: Tensor = step(changes, one, self._fast)(one, other)
+        if not self._quartered:
+            return change
+        # The mean of the quarters that a node has.
+        top, left = first.grid.before(first.finest + len(first.details) - 1 - number)
+        height, width = _size(change)
+        sides = (left, (width + left) % 2, top, (height + top) % 2)
+        return functional.avg_pool2d(functional.pad(change, sides, mode="replicate"), 2)
+
+    def _descended(self, paths: Paths, before: Sequence[Before], items: int = 1) -> Tensor:
+        charges = self._charges(paths.changes, items)
+        return accumulate(paths.local, paths.root, items, before, charges)
+
+    def _charges(self, changes: Sequence[Tensor], items: int = 1) -> list[Charge] | None:
+        if not self.observer.charging:
+            return None
+        options = self.transform.shifts, self.transform.csf == "filter", items
+        return [step(charge, change, self._fast)(change, *options) for change in changes]
+
+    @property
+    def _quartered(self) -> bool:
+        """Whether lowpass planes have the quarters of nodes; see `lowpass_of_light`."""
+        return self.transform.csf == "filter" and self.transform.shifts == 1
 
     def local_differences(self, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
         """Return the local visual difference of every node (Eq. 5), before the root.
@@ -533,7 +557,7 @@ class VDM(TiledMetric):
         """
         constants = self._constants(first.mean.dtype)
         levels = self._levels(first.finest, len(first.details), constants)
-        few = sum(math.prod(_size(detail)) <= FEW_NODES for detail in first.details)
+        few = _few(first)
         return (
             *self._local_differences_of_few(first, second, few, levels, constants),
             *(
@@ -556,20 +580,23 @@ class VDM(TiledMetric):
         level, options = levels.in_a_row(nodes), self._options(constants)
         if self.transform.csf == "filter":
             sight = _weights_alone(level)
-            difference = response_difference(
-                details[0], details[1], sight, sight, *options, self._absolute
-            )
+            difference = response_difference(details[0], details[1], sight, sight, *options)
         else:
             # Both images in one batch, where nothing is computed.
             images = first, second
             parents = _in_a_row(
-                push(torch.cat([cortex.parent_lowpass(number) for cortex in images]), size, items)
+                push(
+                    torch.cat([cortex.parent_lowpass(number) for cortex in images]),
+                    size,
+                    items,
+                    first.before[number],
+                )
                 for number, size in enumerate(sizes)
             )
             both = [parent.clone() for parent in parents.chunk(2)]
             respond = compiled(response_difference_at) if fast else response_difference_at
             seen_at = (both, level, *self._sight_options(constants))
-            difference = respond(*details, seen_at, (*options, self._absolute))
+            difference = respond(*details, seen_at, options)
         around = [self._surrounded(plane, items=items) for plane in _planes(difference, sizes)]
         # Beside one another along the longer side, where the least is left to fill up.
         along = -1 if sizes[-1][0] <= sizes[-1][1] else -2
@@ -597,21 +624,22 @@ class VDM(TiledMetric):
         details, others = first.details[number], second.details[number]
         fast, items = self._fast and details.numel() >= SMALLEST, first.items
         sight, other_sight = (
-            sight.pushed(_size(details), items)
+            sight.pushed(_size(details), items, first.before[number])
             for sight in self._sights(level, constants, (first, second), number, fast)
         )
         orientations = details.shape[2]
         respond = compiled(response_difference) if fast else response_difference
-        # One orientation at a time where the planes are large: what is computed on the way then
-        # stays in the processor's cache. Compiled code keeps nothing on the way.
+        # One orientation at a time where the planes are large and no orientation masks another:
+        # what is computed on the way then stays in the cache. Compiled code keeps nothing.
         at_once = orientations
-        if not fast and details.numel() > LARGEST_AT_ONCE:
+        apart = not (self.observer.signed and self.effects.masking)
+        if apart and not fast and details.numel() > LARGEST_AT_ONCE:
             at_once = self.transform.phases
 
         exponent, options = constants["summation_exponent"], self._options(constants)
 
         def gathered(one: Tensor, other: Tensor, sight: Sight, other_sight: Sight) -> Tensor:
-            difference = respond(one, other, sight, other_sight, *options, self._absolute)
+            difference = respond(one, other, sight, other_sight, *options)
             return self._gathered(difference, exponent, fast, items)
 
         # Where the gradient is known by hand, nothing needs to be kept.
@@ -643,20 +671,14 @@ class VDM(TiledMetric):
                 local.append(self._kept(gathered, *arguments))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]
 
-    def _options(self, constants: dict[str, Tensor]) -> tuple[Tensor, Tensor, bool, bool, int]:
+    def _options(self, constants: dict[str, Tensor]) -> tuple[Tensor, Tensor, bool, bool]:
         """Return what `response` takes beside details and sight."""
         return (
             constants["opponents"],
             constants["transducer_exponent"],
             self.observer.signed,
             self.effects.masking,
-            self.transform.phases,
         )
-
-    @property
-    def _absolute(self) -> bool:
-        """Whether responses that may cancel are pooled as they are, and not as energies."""
-        return self.observer.signed and self.transform.shifts == 1
 
     def _gathered(
         self, difference: Tensor, exponent: Tensor, fast: bool = False, items: int = 1
@@ -669,18 +691,21 @@ class VDM(TiledMetric):
 
     def _surrounded(self, difference: Tensor, fast: bool = False, items: int = 1) -> Tensor:
         """Return response differences with the neighbours that `_pooled_difference` takes."""
-        overlapping, nodes = self._pooling()
+        energies, overlapping, nodes = self._pooling()
+        energy = compiled(phase_energy) if fast else phase_energy
+        if energies:
+            difference = energy(difference, self.transform.phases)
         if not overlapping:
             return surround(difference, items) if nodes > 1 else difference
-        energy = compiled(phase_energy) if fast else phase_energy
         rows = compiled(pool_halves) if fast else pool_halves
-        surrounded = surround_halves(energy(difference, self.transform.phases), nodes)
-        pooled: Tensor = rows(surrounded, nodes, -1)
+        pooled: Tensor = rows(surround_halves(difference, nodes), nodes, -1)
         return pooled
 
-    def _pooling(self) -> tuple[bool, int]:
-        """Return whether nodes overlap, and the side of what is pooled, in nodes."""
-        return self.transform.shifts > 1, 3 if self.effects.pooling else 1
+    def _pooling(self) -> tuple[bool, bool, int]:
+        """Return whether energies are pooled, whether nodes overlap, and how many in a row."""
+        overlapping = self.transform.shifts > 1
+        nodes = 3 if self.effects.pooling else 1
+        return self.observer.signed or overlapping, overlapping, nodes
 
     def _sights(
         self,
@@ -743,6 +768,11 @@ class VDM(TiledMetric):
 
 def _size(plane: Tensor) -> tuple[int, int]:
     return plane.shape[-2], plane.shape[-1]
+
+
+def _few(cortex: Cortex) -> int:
+    """Return how many levels, from the coarsest, are computed at once."""
+    return sum(math.prod(_size(detail)) <= FEW_NODES for detail in cortex.details)
 
 
 def _weights_alone(level: Level) -> Sight:
@@ -828,15 +858,18 @@ def _band_contrast(
 
 
 def _pooled_difference(
-    surrounded: Tensor, overlapping: bool, nodes: int, exponent: Tensor
+    surrounded: Tensor, energies: bool, overlapping: bool, nodes: int, exponent: Tensor
 ) -> Tensor:
     """Return the local visual difference of response differences, pooled over ``nodes`` nodes.
 
     Their neighbours are given. Printed responses are pooled as a difference, for pooling is
-    linear; signed ones come as an absolute difference, for neighbours alternate and would cancel;
-    those of overlapping nodes as energies that are pooled along rows.
+    linear; signed ones come as squares, for neighbours alternate and would cancel; those of
+    overlapping nodes as squares that are pooled along rows.
     """
     if overlapping:
         energy = pool_halves(surrounded, nodes, -2)
         return local_visual_difference_of_energy(energy, covering(nodes), exponent)
-    return local_visual_difference(pool(surrounded) if nodes > 1 else surrounded, exponent)
+    pooled = pool(surrounded) if nodes > 1 else surrounded
+    if energies:
+        return local_visual_difference_of_energy(pooled, 1.0, exponent)
+    return local_visual_difference(pooled, exponent)

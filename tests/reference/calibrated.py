@@ -1,10 +1,11 @@
 """The calibrated observer: the pipeline of ``paper`` with other stages where data asked for them.
 
 What is not here is the paper's own, imported: Eq. 1 to 3, the wavelet's frequencies, the shape of
-the aberration, local contrast, the Butterworth filter, the 3x3 box, Eq. 5 and the
-path sums. All numbers are arguments. Shapes, orders and units as in ``paper``.
+the aberration, the Butterworth filter, the 3x3 box and Eq. 5. All numbers are arguments. Shapes,
+orders and units as in ``paper``.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -22,14 +23,10 @@ from .paper import (
     cone_fundamentals,
     haar_step,
     half_width,
-    level_count,
     level_frequency,
-    local_contrast,
     local_visual_difference,
     opponents,
-    parent_lowpass,
     spatial_pooling,
-    sum_down_paths,
     wavelet_peak,
 )
 
@@ -64,8 +61,8 @@ class CalibratedParameters:
         In the place of Eq. 5's 2.4; no unit.
     lowpass_gains
         Sensitivity of A, C1, C2 to the root lowpass, 1/contrast.
-    score_exponent, score_coefficients, score_window
-        Of the detection score; the window in nodes.
+    charging
+        Whether a difference counts for those pixels alone that made it.
     """
 
     dark_light: float
@@ -91,9 +88,7 @@ class CalibratedParameters:
     transducer_exponent: float
     summation_exponent: float
     lowpass_gains: tuple[float, float, float]
-    score_exponent: float
-    score_coefficients: float
-    score_window: int
+    charging: bool
 
 
 @dataclass(frozen=True)
@@ -123,40 +118,115 @@ class SignedResponses:
     response: tuple[Array, ...]
 
 
+# The grid of nodes
+
+
+@dataclass(frozen=True)
+class Row:
+    """Where the nodes of one level lie along one side of the image.
+
+    Attributes
+    ----------
+    node
+        Pixels of a whole node.
+    begin
+        The first node's first pixel, 0 or before the image, negative.
+    side
+        Pixels of the image.
+    """
+
+    node: int
+    begin: int
+    side: int
+
+    def pixels(self, n: int) -> range:
+        """Pixels of the image that node ``n`` has; none where it lies beyond a border."""
+        start = self.begin + n * self.node
+        return range(max(start, 0), min(start + self.node, self.side))
+
+    def nodes(self) -> int:
+        """Return how many nodes have pixels."""
+        n = 0
+        while self.pixels(n):
+            n += 1
+        return n
+
+    def at(self, pixel: int) -> int:
+        """Return the node that has a pixel."""
+        n = 0
+        while pixel not in self.pixels(n):
+            n += 1
+        return n
+
+
+def rows_of(side: int) -> list[Row]:
+    """Every level's nodes along a side, those of one pixel first, down to a single one.
+
+    Nodes of 4^i pixels begin a third of one before the image, those of 2 x 4^i pixels two thirds,
+    both rounded down to pixels. Where two are left the next level has both in one.
+    """
+    rows = [Row(1, 0, side)]
+    while rows[-1].nodes() > 1:
+        node = 2 * rows[-1].node
+        # Of node = 4^i a third, of 2 x 4^i two: a third of the least power of 4 that is no smaller.
+        power = 1
+        while power < node:
+            power *= 4
+        begin = rows[-1].begin if rows[-1].nodes() == 2 else -(power // 3)
+        rows.append(Row(node, begin, side))
+    return rows
+
+
+def grid_of(height: int, width: int) -> list[tuple[Row, Row]]:
+    """Every level's nodes along y and x, those of one pixel first, down to a single one."""
+    down, across = rows_of(height), rows_of(width)
+    levels = max(len(down), len(across))
+    # A side that has a single node keeps it.
+    return [
+        (down[min(level, len(down) - 1)], across[min(level, len(across) - 1)])
+        for level in range(levels)
+    ]
+
+
 # Cortex filtering
 
 
-def block(n: int, node: int, side: int) -> slice:
-    """Pixels of node ``n`` of an axis of ``side`` pixels, ``node`` pixels to a node."""
-    return slice(n * node, min((n + 1) * node, side))
+def window(plane: Array, row: Row, parent: Row) -> Array:
+    """Give every parent two columns, and let a detail count real pixels, none for more than one.
 
+    A column at the image's border has b of its a pixels. Those that it lacks are taken to be like
+    N, the column beside it inside the image. Then
 
-def border_window(plane: Array, node: int, side: int) -> Array:
-    """Make the number of columns of ``plane`` even, and the last detail that of real pixels.
-
-    The last column R has b of its a = ``node`` pixels, and the one before it, L, has all. The
-    pixels that R lacks are taken to be like L. Then, with
-
-    - an even number of columns: nothing more, L is its sibling;
-    - an odd number: R has no sibling, and L is its partner;
+    - where its parent has both columns: nothing more;
+    - where its parent has no other: N is that;
+    - where both columns are all there are: they keep the mean of all their pixels, and their
+      difference is that of as many pixels as the one with fewer has;
     - one column: repeated.
 
     Parameters
     ----------
     plane
         Lowpass (h, w) of one cone.
-    node, side
-        Pixels in a whole column of ``plane``, and in the image's row.
+    row, parent
+        Where its columns, and their parents, lie.
     """
-    width = plane.shape[1]
+    width = row.nodes()
     if width == 1:
         return np.concatenate((plane, plane), axis=1)
-    pixels = block(width - 1, node, side)
-    b = pixels.stop - pixels.start
-    columns = [plane[:, x].copy() for x in range(width)]
-    columns[-1] = ((node - b) * columns[-2] + b * columns[-1]) / node
-    if width % 2 == 1:
-        columns.append(columns[-2])
+    a = row.node
+    first, last = len(row.pixels(0)), len(row.pixels(width - 1))
+    seen = {n: plane[:, n] for n in range(width)}
+    if width == 2:
+        mean = (first * plane[:, 0] + last * plane[:, 1]) / (first + last)
+        half = min(first, last) / a * (plane[:, 0] - plane[:, 1]) / 2
+        return np.stack((mean + half, mean - half), axis=1)
+    seen[0] = ((a - first) * plane[:, 1] + first * plane[:, 0]) / a
+    seen[width - 1] = ((a - last) * plane[:, width - 2] + last * plane[:, width - 1]) / a
+    seen[-1], seen[width] = seen[1], seen[width - 2]
+    columns = []
+    for n in range(parent.nodes()):
+        left = (parent.begin + n * parent.node - row.begin) // a
+        columns += [seen[left], seen[left + 1]]
     return np.stack(columns, axis=1)
 
 
@@ -170,23 +240,60 @@ def cortex_filtering(sml: Array) -> Pyramid:
     sml
         S, M, L (3, H, W), cd/m2.
     """
-    _, rows, columns = sml.shape
+    grid = grid_of(*sml.shape[1:])
     lowpass = [sml]
     details: list[Array] = []
-    for up in range(level_count(rows, columns)):
-        node = 2**up
+    for (y_child, x_child), (y_row, x_row) in itertools.pairwise(grid):
         step = []
         for plane in lowpass[0]:
-            window = border_window(border_window(plane.T, node, rows).T, node, columns)
-            step.append(haar_step(window)[1])
+            seen = window(window(plane.T, y_child, y_row).T, x_child, x_row)
+            step.append(haar_step(seen)[1])
         details.insert(0, np.stack(step, axis=1))
-        means = np.zeros((3, *details[0].shape[-2:]))
+        means = np.zeros((3, y_row.nodes(), x_row.nodes()))
         for cone, y, x in np.ndindex(means.shape):
+            rows, columns = y_row.pixels(y), x_row.pixels(x)
             means[cone, y, x] = sml[
-                cone, block(y, 2 * node, rows), block(x, 2 * node, columns)
+                cone, rows.start : rows.stop, columns.start : columns.stop
             ].mean()
         lowpass.insert(0, means)
     return Pyramid(tuple(lowpass), tuple(details))
+
+
+# Local contrast
+
+
+def parent_lowpass(pyramid: Pyramid, level: int) -> Array:
+    """Lowpass "one level up in the quad-tree" of every node of a level, (3, h, w), cd/m2.
+
+    The parent of a node has its pixels; the root, which has none, uses its own.
+    """
+    own = pyramid.lowpass[level]
+    if level == 0:
+        return own
+    grid = grid_of(*pyramid.lowpass[-1].shape[1:])[::-1]
+    (y_row, x_row), (y_up, x_up) = grid[level], grid[level - 1]
+    parent = np.zeros(own.shape)
+    for y in range(own.shape[1]):
+        for x in range(own.shape[2]):
+            above = y_up.at(y_row.pixels(y)[0]), x_up.at(x_row.pixels(x)[0])
+            parent[:, y, x] = pyramid.lowpass[level - 1][:, above[0], above[1]]
+    return parent
+
+
+def local_contrast(pyramid: Pyramid, level: int, dark_light: float) -> Array:
+    """Cone contrasts dS/S, dM/M, dL/L of one level (3, 3, h, w) over orientation and cone.
+
+    Parameters
+    ----------
+    pyramid
+        The representation after chromatic aberration, cd/m2.
+    level
+        0 for the root.
+    dark_light
+        cd/m2.
+    """
+    light = np.maximum(parent_lowpass(pyramid, level), 0.0)
+    return np.asarray(pyramid.details[level] / (light + cone_dark_light(dark_light)[:, None, None]))
 
 
 # CSF filtering
@@ -313,20 +420,22 @@ def csf_filtering(
 # Masking transducer
 
 
-def transducer(v: float, exponent: float) -> float:
-    """Signed, for Eq. 4: psi(v) = 2^q v (1 + v^2)^(-q), q = ``exponent``; psi(1) = 1."""
-    return float(2**exponent * v * (1 + v**2) ** -exponent)
+def transducer(v: float, energy: float, exponent: float) -> float:
+    """Signed, for Eq. 4: psi = 2^q v (1 + E)^(-q), q = ``exponent``; 1 where v and E are."""
+    return float(2**exponent * v * (1 + energy) ** -exponent)
 
 
 def masking_transducer(
     weighted: Array, effects: Effects, parameters: CalibratedParameters
 ) -> Array:
-    """Transducer psi on one level (3, C, h, w), signed, 1 at threshold.
+    """Transducer psi on one level, signed, 1 at threshold.
+
+    What masks a contrast is the sum of v^2 over all orientations of its channel at its node.
 
     Parameters
     ----------
     weighted
-        v, (3, C, h, w), signed; 1 at threshold.
+        v, (orientations, C, h, w), signed; 1 at threshold.
     effects
         Without ``masking`` the identity.
     parameters
@@ -335,12 +444,123 @@ def masking_transducer(
     if not effects.masking:
         return weighted
     response = np.zeros(weighted.shape)
-    for at in np.ndindex(weighted.shape):
-        response[at] = transducer(float(weighted[at]), parameters.transducer_exponent)
+    for theta, channel, y, x in np.ndindex(weighted.shape):
+        energy = sum(float(v) ** 2 for v in weighted[:, channel, y, x])
+        response[theta, channel, y, x] = transducer(
+            float(weighted[theta, channel, y, x]), energy, parameters.transducer_exponent
+        )
     return response
 
 
+# Charging
+
+
+def nearest(plane: Array, y: int, x: int) -> float:
+    """Return the value of a node; beyond the border that of the nearest."""
+    height, width = plane.shape
+    return float(plane[min(max(y, 0), height - 1), min(max(x, 0), width - 1)])
+
+
+def mean_around(plane: Array, y: int, x: int, reach: int) -> float:
+    """Return the mean over a node and ``reach`` of them to each side, the border repeated."""
+    steps = range(-reach, reach + 1)
+    return float(np.mean([nearest(plane, y + i, x + j) for i in steps for j in steps]))
+
+
+def squared_change(test: Array, reference: Array) -> Array:
+    """Return c of every node (h, w): the sum over S, M, L (3, h, w) of the squared difference."""
+    return np.asarray(((test - reference) ** 2).sum(0))
+
+
+def change_ratios(change: Array, width: int = 1) -> Array:
+    """Return r of every node: c near by over c around it, 0 where neither differs.
+
+    Parameters
+    ----------
+    change
+        c, (h, w).
+    width
+        How many nodes lie in the width of one: 1, or 2 where they overlap.
+    """
+    ratios = np.zeros(change.shape)
+    for y, x in np.ndindex(change.shape):
+        around = mean_around(change, y, x, 5 * width)
+        if around > 0.0:
+            ratios[y, x] = mean_around(change, y, x, width) / around
+    return ratios
+
+
+def inherited_share(ratio: float) -> float:
+    """q: the share of its parent's sum that a node of a ratio r is charged."""
+    return min(1.0, 1.005 * ratio / (ratio + 0.005)) ** 4
+
+
+def own_share(ratio: float) -> float:
+    """Return the share of its own difference that a node is charged behind a filter."""
+    return min(1.0, ratio / 0.1) ** 4
+
+
+def changes_of_nodes(test: Array, reference: Array) -> list[Array]:
+    """Return c of the nodes of every level, from the root to those of 2 pixels.
+
+    Parameters
+    ----------
+    test, reference
+        Cone images (3, H, W), cd/m2.
+    """
+    grid = grid_of(*test.shape[1:])[:0:-1]
+    changes = []
+    for y_row, x_row in grid:
+        means = [np.zeros((3, y_row.nodes(), x_row.nodes())) for _ in range(2)]
+        for n, m in np.ndindex(means[0].shape[1:]):
+            rows, columns = y_row.pixels(n), x_row.pixels(m)
+            part = slice(None), slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+            for mean, image in zip(means, (test, reference), strict=True):
+                mean[:, n, m] = image[part].mean((1, 2))
+        changes.append(squared_change(*means))
+    return changes
+
+
 # Distance summation
+
+
+def sum_down_paths(
+    lvd: tuple[Array, ...],
+    root: float,
+    height: int,
+    width: int,
+    ratios: list[Array] | None = None,
+    filtered: bool = False,
+) -> Array:
+    """T (H, W) of the finest node of every pixel.
+
+    From the root down T(n) = D(n) + q(n) T(parent of n); the parent of a node has its pixels.
+
+    Parameters
+    ----------
+    lvd
+        D, one (h, w) a level, that of the root first.
+    root
+        T of the root's parent: the lowpass term.
+    height, width
+        Of the image, pixels.
+    ratios
+        r, one (h, w) a level; None: nothing is charged, q is 1.
+    filtered
+        Whether D is charged too.
+    """
+    total = np.full((height, width), root)
+    grid = grid_of(height, width)[:0:-1]
+    for level, ((y_row, x_row), plane) in enumerate(zip(grid, lvd, strict=True)):
+        for n, m in np.ndindex(plane.shape):
+            own, inherited = 1.0, 1.0
+            if ratios is not None:
+                inherited = inherited_share(float(ratios[level][n, m]))
+                own = own_share(float(ratios[level][n, m])) if filtered else 1.0
+            for y in y_row.pixels(n):
+                for x in x_row.pixels(m):
+                    total[y, x] = own * plane[n, m] + inherited * total[y, x]
+    return total
 
 
 def lowpass_contrast(test: Array, reference: Array, dark_light: float) -> Array:
@@ -366,6 +586,10 @@ def lowpass_contrast(test: Array, reference: Array, dark_light: float) -> Array:
         mean = (max(test[cone], 0.0) + max(reference[cone], 0.0)) / 2
         contrast[cone] = (test[cone] - reference[cone]) / (mean + dark[cone])
     return contrast
+
+
+# A difference between means counts for no more, JND: values below 0 may make it any.
+LARGEST_DIFFERENCE = 1e5
 
 
 def lowpass_term(
@@ -394,7 +618,8 @@ def lowpass_term(
     opponent = opponents(contrast[None, :, None, None], effects)[0, :, 0, 0]
     term = 0.0
     for channel, value in enumerate(opponent):
-        term += abs(parameters.lowpass_gains[channel] * value) ** parameters.summation_exponent
+        seen = min(abs(parameters.lowpass_gains[channel] * value), LARGEST_DIFFERENCE)
+        term += seen**parameters.summation_exponent
     return float(term)
 
 
@@ -438,9 +663,10 @@ def compare(
     parameters: CalibratedParameters,
     effects: Effects = ALL_ON,
 ) -> tuple[Array, ...]:
-    """Spatial pooling of abs(R_1 - R_2), then Eq. 5: the LVD of every node, one (h, w) a level.
+    """Spatial pooling of (R_1 - R_2)^2, then Eq. 5 of its root: D of every node.
 
-    The magnitude is pooled because signed responses of neighbours alternate and would cancel.
+    One (h, w) a level, that of the root first. The square is pooled because signed responses of
+    neighbours alternate and would cancel.
 
     Returns
     -------
@@ -449,7 +675,7 @@ def compare(
     """
     return tuple(
         local_visual_difference(
-            spatial_pooling(np.abs(r1 - r2), effects), parameters.summation_exponent
+            np.sqrt(spatial_pooling((r1 - r2) ** 2, effects)), parameters.summation_exponent
         )
         for r1, r2 in zip(test.response, reference.response, strict=True)
     )
@@ -462,7 +688,7 @@ def jnd_map(
     parameters: CalibratedParameters,
     effects: Effects = ALL_ON,
 ) -> Array:
-    """Visual difference map of the calibrated observer.
+    """Visual difference map of the calibrated observer, ``Haar``.
 
     Parameters
     ----------
@@ -489,48 +715,10 @@ def jnd_map(
         effects,
     )
     _, height, width = test_xyz.shape
-    total = sum_down_paths(lvd, height, width)
-    total += lowpass_term(test, reference, effects, parameters)
+    ratios = None
+    if parameters.charging:
+        cones = cone_fundamentals(test_xyz), cone_fundamentals(reference_xyz)
+        ratios = [change_ratios(change) for change in changes_of_nodes(*cones)]
+    root = lowpass_term(test, reference, effects, parameters)
+    total = sum_down_paths(lvd, root, height, width, ratios)
     return np.asarray(total ** (1 / parameters.summation_exponent))
-
-
-def glance_weight(offset: float, window: int) -> float:
-    """Weight of a node ``offset`` nodes from the middle of a glance, along one axis."""
-    return max(0.0, 1 - abs(offset) / window)
-
-
-def detection_score(
-    test_xyz: Array, reference_xyz: Array, ppd: float, parameters: CalibratedParameters
-) -> float:
-    """Detection score of an image as one stimulus, JND; arguments as in `jnd_map`.
-
-    Around every node of a level the powers of the response differences are summed, with weights
-    that fall linearly over ``score_window`` nodes; these sums are added down the paths of the
-    quad-tree, and the leaf with the largest total tells.
-    """
-    p = parameters
-    test = represent(test_xyz, ppd, p)
-    reference = represent(reference_xyz, ppd, p)
-    r1 = respond(test, ppd, p).response
-    r2 = respond(reference, ppd, p).response
-    glances = []
-    for one, other in zip(r1, r2, strict=True):
-        power = (np.abs(one - other) ** p.score_exponent).sum((0, 1))
-        height, width = power.shape
-        total = np.zeros((height, width))
-        for y, x in np.ndindex(height, width):
-            for v, u in np.ndindex(height, width):
-                weight = glance_weight(y - v, p.score_window) * glance_weight(x - u, p.score_window)
-                total[y, x] += weight * power[v, u]
-        glances.append(total)
-    _, height, width = test_xyz.shape
-    leaves = sum_down_paths(tuple(glances), height, width)
-    contrast = lowpass_contrast(
-        test.lowpass[-1].mean((1, 2)), reference.lowpass[-1].mean((1, 2)), p.dark_light
-    )
-    opponent = opponents(contrast[None, :, None, None], ALL_ON)[0, :, 0, 0]
-    lowpass = sum(
-        abs(gain * value) ** p.score_exponent
-        for gain, value in zip(p.lowpass_gains, opponent, strict=True)
-    )
-    return float((leaves.max() / p.score_coefficients + lowpass) ** (1 / p.score_exponent))

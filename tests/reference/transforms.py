@@ -5,12 +5,26 @@ by itself, over the pixels or samples that it covers; an image goes on beyond it
 row and column.
 """
 
+import itertools
 import math
 from functools import cache
 
 import numpy as np
 
-from .calibrated import CalibratedParameters, glance_weight, lowpass_term, sensitivity
+from .calibrated import (
+    CalibratedParameters,
+    change_ratios,
+    cortex_filtering,
+    grid_of,
+    inherited_share,
+    lowpass_term,
+    masking_transducer,
+    own_share,
+    sensitivity,
+    squared_change,
+    sum_down_paths,
+)
+from .calibrated import nearest as at
 from .paper import (
     ALL_ON,
     SML_TO_OPPONENT,
@@ -21,15 +35,11 @@ from .paper import (
     cone_dark_light,
     cone_fundamentals,
     level_count,
+    local_visual_difference,
+    spatial_pooling,
     wavelet_peak,
 )
 from .sarnoff import BURT, correlate, transfer
-
-
-def at(plane: Array, y: int, x: int) -> float:
-    """Return the value at a place; beyond the border the nearest."""
-    y, x = min(max(y, 0), plane.shape[0] - 1), min(max(x, 0), plane.shape[1] - 1)
-    return float(plane[y, x])
 
 
 def box_means(plane: Array, node: int) -> Array:
@@ -338,7 +348,6 @@ def level_responses(
 
     ``peaks`` are frequency, cycles/pixel, and gain of every level, for d3 those of `diagonal_peak`.
     """
-    q = parameters.transducer_exponent
     if kind == "filtered":
         planes = [stationary_haar(seen) for seen in weighted_contrast(image, ppd, parameters)]
         responses = []
@@ -346,7 +355,7 @@ def level_responses(
             weighted = np.stack([channel[level][0] for channel in planes], axis=1)
             weighted /= wavelet_peak(2**level)[1]
             weighted[2] /= diagonal_share()
-            responses.append(2.0**q * weighted / (1.0 + weighted**2) ** q)
+            responses.append(masking_transducer(weighted, ALL_ON, parameters))
         return responses
     cones = cone_fundamentals(image)
     dark = cone_dark_light(parameters.dark_light)
@@ -376,11 +385,7 @@ def level_responses(
                 opponent = SML_TO_OPPONENT @ contrast[orientation]
                 seen = np.array(sensitivity(ppd * f, luminance, parameters))
                 weighted[orientation, :, y, x] = opponent * seen / g
-        energy = weighted**2
-        if kind == "steerable":
-            for even in range(0, 8, 2):
-                energy[even : even + 2] = energy[even] + energy[even + 1]
-        responses.append(2.0**q * weighted / (1.0 + energy) ** q)
+        responses.append(masking_transducer(weighted, ALL_ON, parameters))
     return responses
 
 
@@ -402,6 +407,36 @@ def pair_differences(
     return squares
 
 
+def changes_of_halves(
+    test: Array, reference: Array, kind: str, peaks: list[tuple[float, float]]
+) -> list[Array]:
+    """Return c at the halves of nodes of every level, the finest first.
+
+    Of the nodes' own lowpass; behind a filter of the means of their quarters, which the halves are.
+
+    Parameters
+    ----------
+    test, reference
+        Cone images (3, H, W), cd/m2.
+    kind, peaks
+        As in `level_responses`.
+    """
+    changes = []
+    for level in range(level_count(*test.shape[1:])):
+        means = []
+        for image in (test, reference):
+            if kind == "filtered":
+                planes = [box_means(cone, 2**level) for cone in image]
+            elif kind == "stationary":
+                planes = [stationary_haar(cone)[level][1] for cone in image]
+            else:
+                frequencies = [frequency for frequency, _ in peaks]
+                planes = [steerable(cone, frequencies)[level][1] for cone in image]
+            means.append(np.stack(planes))
+        changes.append(squared_change(*means))
+    return changes
+
+
 def jnd_map(
     test: Array,
     reference: Array,
@@ -412,47 +447,80 @@ def jnd_map(
 ) -> Array:
     """Return the map (H, W), JND, of two images (3, H, W), XYZ in cd/m2."""
     height, width = test.shape[1:]
-    cones = [Pyramid((cone_fundamentals(image),), ()) for image in (test, reference)]
-    total = np.full((height, width), lowpass_term(cones[0], cones[1], ALL_ON, parameters))
+    cones = [cone_fundamentals(image) for image in (test, reference)]
+    one, other = (Pyramid((image,), ()) for image in cones)
+    total = np.full((height, width), lowpass_term(one, other, ALL_ON, parameters))
     squares = pair_differences(test, reference, ppd, kind, peaks, parameters)
-    for level, square in enumerate(squares):
+    changes = changes_of_halves(cones[0], cones[1], kind, peaks)
+    for level in reversed(range(len(squares))):
+        square = squares[level]
         local = np.zeros(square.shape[2:])
         for orientation, channel in np.ndindex(square.shape[:2]):
             pooled = box_over_shifts(square[orientation, channel], 3)
             local += pooled ** (0.5 * parameters.summation_exponent)
+        ratios = change_ratios(changes[level], 2)
         for y, x in np.ndindex(height, width):
-            total[y, x] += local[y // 2**level, x // 2**level]
+            half = y // 2**level, x // 2**level
+            own, inherited = 1.0, 1.0
+            if parameters.charging:
+                inherited = inherited_share(float(ratios[half]))
+                own = own_share(float(ratios[half])) if kind == "filtered" else 1.0
+            total[y, x] = own * local[half] + inherited * total[y, x]
     return np.asarray(total ** (1.0 / parameters.summation_exponent))
 
 
-def score_sum(
-    test: Array,
-    reference: Array,
-    ppd: float,
-    kind: str,
-    peaks: list[tuple[float, float]],
-    parameters: CalibratedParameters,
-    exponent: float,
-) -> float:
-    """Return the largest sum of the detection score, before its root, without the lowpass term.
+def changes_of_quarters(test: Array, reference: Array) -> list[Array]:
+    """Return c of the nodes of `Haar` behind a filter, from the root to those of 2 pixels.
 
-    A quarter of the nodes are as many as side by side; and a cosine's mean power, found by summing
-    it up, is that of its absolute value and not that of its mean square. A glance is one half node
-    wider than twice as many half nodes as nodes.
+    The mean over the quarters that a node has of c of their means: a quarter is a node of the next
+    finer level, or a pixel. ``test``, ``reference``: cone images (3, H, W), cd/m2.
     """
-    phase = np.linspace(0.0, 2.0 * math.pi, 100000, endpoint=False)
-    spread = np.mean(np.abs(np.cos(phase)) ** exponent) / 0.5 ** (0.5 * exponent)
-    height, width = test.shape[1:]
-    total = np.zeros((height, width))
-    window = 2 * parameters.score_window + 1
-    squares = pair_differences(test, reference, ppd, kind, peaks, parameters)
-    for level, square in enumerate(squares):
-        power = np.zeros(square.shape[2:])
-        for orientation, channel in np.ndindex(square.shape[:2]):
-            covered = box_over_shifts(square[orientation, channel], 1)
-            power += covered ** (0.5 * exponent) * spread / 4.0
-        for y, x in np.ndindex(height, width):
-            for v, u in np.ndindex(power.shape):
-                down = glance_weight(y // 2**level - v, window)
-                total[y, x] += down * glance_weight(x // 2**level - u, window) * power[v, u]
-    return float(total.max())
+    grid = grid_of(*test.shape[1:])[::-1]
+    changes = []
+    for (y_row, x_row), (y_finer, x_finer) in itertools.pairwise(grid):
+        change = np.zeros((y_row.nodes(), x_row.nodes()))
+        for n, m in np.ndindex(change.shape):
+            rows, columns = (
+                sorted({finer.at(pixel) for pixel in row.pixels(node)})
+                for row, finer, node in ((y_row, y_finer, n), (x_row, x_finer, m))
+            )
+            of_quarters = []
+            for y, x in itertools.product(rows, columns):
+                down, across = y_finer.pixels(y), x_finer.pixels(x)
+                part = slice(None), slice(down[0], down[-1] + 1), slice(across[0], across[-1] + 1)
+                means = [image[part].mean((1, 2)) for image in (test, reference)]
+                of_quarters.append(float(((means[0] - means[1]) ** 2).sum()))
+            change[n, m] = np.mean(of_quarters)
+        changes.append(change)
+    return changes
+
+
+def filtered_haar_map(
+    test: Array, reference: Array, ppd: float, parameters: CalibratedParameters
+) -> Array:
+    """Return the map (H, W), JND, of `Haar` behind a filter; images (3, H, W), XYZ in cd/m2."""
+    responses = []
+    for image in (test, reference):
+        details = cortex_filtering(weighted_contrast(image, ppd, parameters)).details
+        levels = []
+        for level, plane in enumerate(details):
+            finer = len(details) - 1 - level
+            weighted = plane / wavelet_peak(2**finer)[1]
+            weighted[2] /= diagonal_share()
+            levels.append(masking_transducer(weighted, ALL_ON, parameters))
+        responses.append(levels)
+    lvd = tuple(
+        local_visual_difference(
+            np.sqrt(spatial_pooling((one - other) ** 2, ALL_ON)), parameters.summation_exponent
+        )
+        for one, other in zip(*responses, strict=True)
+    )
+    cones = cone_fundamentals(test), cone_fundamentals(reference)
+    ratios = None
+    if parameters.charging:
+        ratios = [change_ratios(change) for change in changes_of_quarters(*cones)]
+    first, second = (Pyramid((image,), ()) for image in cones)
+    root = lowpass_term(first, second, ALL_ON, parameters)
+    _, height, width = test.shape
+    total = sum_down_paths(lvd, root, height, width, ratios, filtered=True)
+    return np.asarray(total ** (1.0 / parameters.summation_exponent))

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torch_vdm.cortex.transform import CSF, DEEPEST, Base, Cortex, checked_csf, mean_of
 from torch_vdm.fast import step
+from torch_vdm.grid import PAPERS, Grid, thirds
 from torch_vdm.quadtree import apart, complete, own, pad_even, together
 
 # The exponent of the sum over coefficients by which a diagonal grating is made as strong as a
@@ -47,14 +48,24 @@ class Haar:
         """Refuse what is no option."""
         checked_csf(self.csf)
 
+    def grid(self, size: tuple[int, int], true_means: bool) -> Grid:
+        """Return where the nodes lie on an image: a third of a node off with ``true_means``."""
+        return thirds(size) if true_means else PAPERS
+
     def decompose(
-        self, planes: Tensor, fast: bool = False, true_means: bool = False, items: int = 1
+        self,
+        planes: Tensor,
+        fast: bool = False,
+        true_means: bool = False,
+        items: int = 1,
+        *,
+        grid: Grid | None = None,
     ) -> Cortex:
         """Decompose (B, C, H, W) by Eq. 2 down to one node, by compiled steps if ``fast``.
 
         ``true_means``: a node at the border counts for the pixels that it has. Else for as many
         as its siblings, as the repeated last row or column of an odd side makes it. ``items``: so
-        many images lie below one another.
+        many images lie below one another. ``grid``: that of a part of an image.
 
         Returns
         -------
@@ -63,15 +74,21 @@ class Haar:
         """
         size = (planes.shape[-2] // items, planes.shape[-1])
         base = Base(planes, 0, size, mean_of(planes, items))
-        return self.coarser(base, fast, true_means, items=items)
+        return self.coarser(base, fast, true_means, items=items, grid=grid)
 
     def begin(
-        self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
+        self,
+        planes: Tensor,
+        count: int,
+        fast: bool = False,
+        true_means: bool = False,
+        *,
+        grid: Grid | None = None,
     ) -> tuple[Cortex, Tensor]:
         """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
         size = (planes.shape[-2], planes.shape[-1])
         base = Base(planes, 0, size, planes[..., :1, :1])
-        cortex = self.coarser(base, fast, true_means, count)
+        cortex = self.coarser(base, fast, true_means, count, grid=grid)
         return cortex, cortex.lowpass[1]
 
     def rest(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
@@ -79,16 +96,25 @@ class Haar:
         return self.coarser(base, fast, true_means)
 
     def reduced(
-        self, planes: Tensor, octaves: int, fast: bool = False, true_means: bool = False
+        self,
+        planes: Tensor,
+        octaves: int,
+        fast: bool = False,
+        true_means: bool = False,
+        *,
+        grid: Grid | None = None,
     ) -> Tensor:
         """Return the means of nodes of 2^octaves pixels; arguments as `decompose`."""
         size = (planes.shape[-2], planes.shape[-1])
-        return [planes, *levels(planes, 1, size, fast, true_means, octaves)[1]][octaves]
+        if grid is None:
+            grid = self.grid(size, true_means)
+        return [planes, *levels(planes, 0, size, fast, true_means, grid, octaves)[1]][octaves]
 
     def resume(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
         """Decompose the rest of an image; see `Transform.resume`."""
         # The first step is a level that tiles have.
-        _, (plane,) = levels(base.plane, 2**base.octaves, base.size, fast, true_means, 1)
+        grid = self.grid(base.size, true_means)
+        _, (plane,) = levels(base.plane, base.octaves, base.size, fast, true_means, grid, 1)
         rest = base._replace(plane=plane, octaves=base.octaves + 1)
         return self.coarser(rest, fast, true_means)
 
@@ -99,15 +125,18 @@ class Haar:
         true_means: bool = False,
         count: int = DEEPEST,
         items: int = 1,
+        grid: Grid | None = None,
     ) -> Cortex:
         """Return the levels of `decompose`, at most ``count``, without its ``base.octaves`` finest.
 
         The plane of ``base`` has the means of nodes of 2^octaves pixels.
         """
         plane, octaves, size, mean = base
-        details, lowpass = levels(plane, 2**octaves, size, fast, true_means, count, items)
+        if grid is None:
+            grid = self.grid(size, true_means)
+        details, lowpass = levels(plane, octaves, size, fast, true_means, grid, count, items)
         coarsest_first = tuple(reversed(details)), tuple(reversed(lowpass or [plane]))
-        return Cortex(*coarsest_first, mean, octaves, items)
+        return Cortex(*coarsest_first, mean, octaves, items, grid)
 
     def peak(self, level_from_finest: int) -> tuple[float, float]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there."""
@@ -127,39 +156,64 @@ class Haar:
 
 def levels(
     planes: Tensor,
-    node: int,
+    octaves: int,
     size: tuple[int, int],
     fast: bool,
     true_means: bool,
+    grid: Grid,
     count: int = DEEPEST,
     items: int = 1,
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Return details and lowpass of the ``count`` finest levels, the finest first.
 
-    ``planes`` (B, C, h, w) are the means of nodes of ``node`` x ``node`` pixels of an image of
-    ``size`` = (H, W) pixels; or (1, C, items h, w) of ``items`` of them.
+    ``planes`` (B, C, h, w) are the means of nodes of 2^octaves pixels a side, which lie as ``grid``
+    says, of an image of ``size`` = (H, W) pixels; or (1, C, items h, w) of ``items`` of them.
     """
 
     def analyse(even: Tensor) -> tuple[Tensor, ...]:
         both: tuple[Tensor, ...] = step(_analyse, even, fast)(even)
         return both
 
-    found = _descended(planes, node, size, true_means, count, analyse, items)
+    found = _descended(planes, octaves, size, true_means, grid, count, analyse, items)
     return [detail for _, detail in found], [lowpass for lowpass, _ in found]
 
 
 def lowpasses(
-    planes: Tensor, node: int, size: tuple[int, int], true_means: bool, count: int = DEEPEST
+    planes: Tensor,
+    octaves: int,
+    size: tuple[int, int],
+    true_means: bool,
+    count: int = DEEPEST,
+    grid: Grid = PAPERS,
 ) -> list[Tensor]:
     """Return the lowpass that `levels` does, without the details."""
-    return [lowpass for (lowpass,) in _descended(planes, node, size, true_means, count, _means)]
+    found = _descended(planes, octaves, size, true_means, grid, count, _means)
+    return [lowpass for (lowpass,) in found]
+
+
+def lowpass_of_light(cortex: Cortex, light: Base, true_means: bool) -> Cortex:
+    """Return a representation of filtered planes with the mean and lowpass of their light.
+
+    What is decomposed behind a filter is no light; which pixels differ is asked of the light.
+    ``light``: cone responses, from which the levels of ``cortex`` or finer ones follow. The lowpass
+    of a level are the means of the quarters of its nodes, on the plane of its details where these
+    overlap and else on one of twice its sides.
+    """
+    if not cortex.details:
+        return cortex._replace(mean=light.mean)
+    first = cortex.finest - light.octaves
+    last = first + len(cortex.details)
+    means = lowpasses(light.plane, light.octaves, light.size, true_means, last - 1, cortex.grid)
+    planes = [light.plane, *means][first:last]
+    return cortex._replace(mean=light.mean, lowpass=tuple(reversed(planes)))
 
 
 def _descended(
     planes: Tensor,
-    node: int,
+    octaves: int,
     size: tuple[int, int],
     true_means: bool,
+    grid: Grid,
     count: int,
     analyse: Callable[[Tensor], tuple[Tensor, ...]],
     items: int = 1,
@@ -175,13 +229,13 @@ def _descended(
     found: list[tuple[Tensor, ...]] = []
     while max(planes.shape[-2] // items, planes.shape[-1]) > 1 and len(found) < count:
         if true_means:
-            completed = each(partial(complete, size=size, node=node), planes)
+            sides = grid.sides(size, octaves + len(found))
+            completed = each(partial(complete, sides=sides), planes)
             mean_of_all, *details = analyse(completed)
-            planes = each(partial(own, size=size, node=node), mean_of_all, planes)
+            planes = each(partial(own, sides=sides), mean_of_all, planes)
         else:
             planes, *details = analyse(each(pad_even, planes))
         found.append((planes, *details))
-        node *= 2
     return found
 
 

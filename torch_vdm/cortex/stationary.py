@@ -17,8 +17,8 @@ from torch_vdm.cortex.haar import (
 )
 from torch_vdm.cortex.transform import CSF, Base, Cortex, checked_csf, mean_of
 from torch_vdm.fast import step
+from torch_vdm.grid import PAPERS, Grid, Side
 from torch_vdm.interleave import interleaved
-from torch_vdm.quadtree import share
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,18 @@ class StationaryHaar:
         """Refuse what is no option."""
         checked_csf(self.csf)
 
-    def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:
+    def grid(self, size: tuple[int, int], true_means: bool) -> Grid:  # noqa: ARG002
+        """Return where the nodes lie on an image: the first begin with it."""
+        return PAPERS
+
+    def decompose(
+        self,
+        planes: Tensor,
+        fast: bool = False,
+        true_means: bool = False,
+        *,
+        grid: Grid | None = None,  # noqa: ARG002  # as `grid`
+    ) -> Cortex:
         """Decompose (B, C, H, W) to the coarsest level; arguments as `Haar.decompose`.
 
         Returns
@@ -67,7 +78,7 @@ class StationaryHaar:
         """
         size = (planes.shape[-2], planes.shape[-1])
         mean = mean_of(planes)
-        means = lowpasses(planes, 1, size, true_means)
+        means = lowpasses(planes, 0, size, true_means)
         # The means of nodes of 1, 1, 2, 4 ... pixels: halves of the finest, quarters of all others.
         parts = [planes, planes, *means][: len(means)]
         if not parts:
@@ -75,11 +86,17 @@ class StationaryHaar:
         return self._cortex(parts, 0, size, mean, fast, true_means)
 
     def begin(
-        self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
+        self,
+        planes: Tensor,
+        count: int,
+        fast: bool = False,
+        true_means: bool = False,
+        *,
+        grid: Grid | None = None,  # noqa: ARG002  # as `grid`
     ) -> tuple[Cortex, Tensor]:
         """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
         size = (planes.shape[-2], planes.shape[-1])
-        means = lowpasses(planes, 1, size, true_means, count - 2)
+        means = lowpasses(planes, 0, size, true_means, count - 2)
         parts = [planes, planes, *means]
         none = planes[..., :1, :1]
         return self._cortex(parts, 0, size, none, fast, true_means), means[-1]
@@ -94,14 +111,16 @@ class StationaryHaar:
         octaves: int,
         fast: bool = False,  # noqa: ARG002  # as in `decompose`
         true_means: bool = False,
+        *,
+        grid: Grid | None = None,  # noqa: ARG002  # as `grid`
     ) -> Tensor:
         """Return the means of nodes of 2^octaves pixels; arguments as `decompose`."""
         size = (planes.shape[-2], planes.shape[-1])
-        return [planes, *lowpasses(planes, 1, size, true_means, octaves)][octaves]
+        return [planes, *lowpasses(planes, 0, size, true_means, octaves)][octaves]
 
     def resume(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
         """Decompose the rest of an image; see `Transform.resume`."""
-        means = lowpasses(base.plane, 2**base.octaves, base.size, true_means)
+        means = lowpasses(base.plane, base.octaves, base.size, true_means)
         parts = [base.plane, *means][: len(means) - 1]
         return self._cortex(parts, base.octaves + 1, base.size, base.mean, fast, true_means)
 
@@ -129,7 +148,7 @@ class StationaryHaar:
         # Of what the image is adapted to, nothing is asked after its filter.
         means = self.csf == "levels"
         for level, part in enumerate(parts, finest):
-            faded = _faded(part, size, 2 ** max(level - 1, 0)) if true_means else part
+            faded = _faded(part, PAPERS.sides(size, max(level - 1, 0))) if true_means else part
             analyse = _halves if level == 0 else _quarters
             detail, *lowest = step(analyse, part, fast)(faded, means)
             details.append(detail)
@@ -137,15 +156,14 @@ class StationaryHaar:
         return Cortex(tuple(reversed(details)), tuple(reversed(lowpass)), mean, finest)
 
 
-def _faded(parts: Tensor, size: tuple[int, int], node: int) -> Tensor:
+def _faded(parts: Tensor, sides: tuple[Side, Side]) -> Tensor:
     """Weaken a last row or column that has only a share r of its pixels.
 
     R becomes L + 2 r / (1 + r) (R - L), where L is its neighbour, so that (L + R) / 2 is the mean
     of the real pixels of both.
     """
-    for side, axis in zip(size, (-2, -1), strict=True):
-        count = parts.shape[axis]
-        real = share(side, node)
+    for side, axis in zip(sides, (-2, -1), strict=True):
+        count, real = parts.shape[axis], side.last
         if count == 1 or real == 1.0:
             continue
         before, last = parts.narrow(axis, count - 2, 1), parts.narrow(axis, count - 1, 1)

@@ -13,6 +13,7 @@ from torch_vdm.cortex import oriented
 from torch_vdm.cortex.gaussian import blur, lowpass_response
 from torch_vdm.cortex.transform import CSF, DEEPEST, Base, Cortex, mean_of
 from torch_vdm.fast import SMALLEST, step
+from torch_vdm.grid import PAPERS, Grid
 from torch_vdm.interleave import interleaved
 
 # The image half-way between its pixels, which the finest level needs: a sinc of so many taps on
@@ -68,7 +69,18 @@ class Steerable:
         """Find the peaks once: a graph of torch.compile takes them as they are."""
         object.__setattr__(self, "_peaks", tuple(_peak(level) for level in range(DEEPEST)))
 
-    def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:  # noqa: ARG002
+    def grid(self, size: tuple[int, int], true_means: bool) -> Grid:  # noqa: ARG002
+        """Return where the nodes lie on an image: the first begin with it."""
+        return PAPERS
+
+    def decompose(
+        self,
+        planes: Tensor,
+        fast: bool = False,
+        true_means: bool = False,  # noqa: ARG002  # see below
+        *,
+        grid: Grid | None = None,  # noqa: ARG002  # as `grid`
+    ) -> Cortex:
         """Decompose (B, C, H, W) to the coarsest level, by compiled steps if ``fast``.
 
         ``true_means`` changes nothing: no sample of this pyramid stands for repeated pixels.
@@ -85,7 +97,13 @@ class Steerable:
         return self._cortex(planes, band - blur(band, fast), 0, mean, fast)
 
     def begin(
-        self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
+        self,
+        planes: Tensor,
+        count: int,
+        fast: bool = False,
+        true_means: bool = False,
+        *,
+        grid: Grid | None = None,  # noqa: ARG002  # as `grid`
     ) -> tuple[Cortex, Tensor]:
         """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
         band = _doubled(_doubled(planes, -1), -2)
@@ -103,6 +121,8 @@ class Steerable:
         octaves: int,
         fast: bool = False,
         true_means: bool = False,  # noqa: ARG002  # as in `decompose`
+        *,
+        grid: Grid | None = None,  # noqa: ARG002  # as `grid`
     ) -> Tensor:
         """Return the Gaussian pyramid's plane; arguments as `decompose`."""
         for _ in range(octaves):

@@ -4,6 +4,7 @@ from typing import Literal, NamedTuple, Protocol
 
 from torch import Tensor
 
+from torch_vdm.grid import PAPERS, Before, Grid
 from torch_vdm.quadtree import apart, together
 
 # Levels that constants are made for: an image of 2^24 pixels a side.
@@ -37,6 +38,8 @@ class Cortex(NamedTuple):
         How many levels finer than these the image has; see `Transform.resume`.
     items
         How many images lie below one another in every plane; where there are several, B is 1.
+    grid
+        Where the nodes lie on the image.
     """
 
     details: tuple[Tensor, ...]
@@ -44,6 +47,12 @@ class Cortex(NamedTuple):
     mean: Tensor
     finest: int = 0
     items: int = 1
+    grid: Grid = PAPERS
+
+    @property
+    def before(self) -> tuple[Before, ...]:
+        """What is put before the first node of each level where it has its parents."""
+        return self.grid.down(len(self.details), self.finest)
 
     def parent_lowpass(self, level: int) -> Tensor:
         """Return the lowpass one level up from ``level``; the root's is its own."""
@@ -104,14 +113,35 @@ class Transform(Protocol):
         lowpass.
         """
 
-    def decompose(self, planes: Tensor, fast: bool = False, true_means: bool = False) -> Cortex:
+    def grid(self, size: tuple[int, int], true_means: bool) -> Grid:
+        """Return where the nodes lie on an image of ``size``, for parents and for paths.
+
+        With ``true_means`` as `decompose` takes it.
+        """
+
+    def decompose(
+        self,
+        planes: Tensor,
+        fast: bool = False,
+        true_means: bool = False,
+        *,
+        grid: Grid | None = None,
+    ) -> Cortex:
         """Decompose (B, C, H, W) to the coarsest level, by compiled steps if ``fast``.
 
         ``true_means``: no pixel counts for more than another, at the border of an odd side too.
+        ``grid``: that of a part of an image, a `Grid.part`; by default that of an image of this
+        size.
         """
 
     def reduced(
-        self, planes: Tensor, octaves: int, fast: bool = False, true_means: bool = False
+        self,
+        planes: Tensor,
+        octaves: int,
+        fast: bool = False,
+        true_means: bool = False,
+        *,
+        grid: Grid | None = None,
     ) -> Tensor:
         """Return (B, C, H, W) at 1 / 2^octaves of its sides, rounded up: what `resume` takes."""
 
@@ -122,7 +152,13 @@ class Transform(Protocol):
         """
 
     def begin(
-        self, planes: Tensor, count: int, fast: bool = False, true_means: bool = False
+        self,
+        planes: Tensor,
+        count: int,
+        fast: bool = False,
+        true_means: bool = False,
+        *,
+        grid: Grid | None = None,
     ) -> tuple[Cortex, Tensor]:
         """Return the ``count`` finest levels of `decompose`, 3 or more, and what `rest` needs.
 
