@@ -129,14 +129,14 @@ def test_nor_in_strips(transform: Transform, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @each
-@pytest.mark.parametrize("tile", [16, 64])
+@pytest.mark.parametrize("tile", [64])
 def test_nor_in_tiles(transform: Transform, tile: int) -> None:
     for change in CHANGES:
         test, reference = change.images()
         check(metric_of(transform).tiled(test, reference, tile), change, transform)
 
 
-@each
+@pytest.mark.parametrize("transform", [Haar(), StationaryHaar("filter")], ids=repr)
 def test_nor_by_the_compiled_route(transform: Transform) -> None:
     # Of one dtype and with the options of other tests: each function is compiled once for all.
     fast = VDM(64.0, transform=transform).compile()
