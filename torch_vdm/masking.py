@@ -41,6 +41,7 @@ def masking_energy(contrast: Tensor) -> Tensor:
 
     ``contrast`` is (B, channels, orientations, h, w), even and odd ones of a pair among them. A
     grating hides one at right angles to it as much as people say (Foley 1994, within 0.5 dB over
-    the threshold without a mask); the same direction alone would hide 12 dB less. Status: choice, measured.
+    the threshold without a mask); the same direction alone would hide 12 dB less. Status: choice,
+    measured.
     """
     return (contrast * contrast).sum(2, keepdim=True)
