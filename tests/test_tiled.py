@@ -129,8 +129,8 @@ def test_only_what_is_needed_is_read_and_steps_are_told() -> None:
     assert given is out
     torch.testing.assert_close(out, VDM()(test, reference)[0], rtol=0.0, atol=1e-5)
     assert largest <= 64 * (32 + 2 * 96)
-    # 3 x 13 tiles, for the first begin before the image; each is read twice.
-    assert steps == [(done, 78) for done in range(1, 79)]
+    # 3 x 14 tiles, for the first begin before the image; each is read twice.
+    assert steps == [(done, 84) for done in range(1, 85)]
 
 
 def test_nonfinite_pixels_are_named_or_masked() -> None:
