@@ -16,8 +16,8 @@ from torch_vdm.vdm import VDM
 Reduction = Literal["mean", "sum", "none"]
 
 # Weight of the L1 term. Status: choice, by experiment: of 0, 30, 60, 120, 240 and 360 the one with
-# which 300 steps of Adam on its pixels bring a picture back under 1 JND everywhere with room to spare,
-# from noise, from flat grey, black and white, and from a shift by 8 pixels.
+# which 300 steps of Adam on its pixels bring a picture back under 1 JND everywhere with room to
+# spare, from noise, from flat grey, black and white, and from a shift by 8 pixels.
 L1 = 360.0
 
 
