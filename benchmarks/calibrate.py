@@ -24,8 +24,8 @@ from torch import Tensor, nn
 from torch.func import functional_call, jacfwd
 from torch.nn import functional
 
-from benchmarks import record
-from benchmarks.people import PPD, PPDS, zone_scores, zones
+from benchmarks import people, record
+from benchmarks.people import DECIBELS, PPD, PPDS, zone_scores, zones
 from benchmarks.thresholds import (
     Threshold,
     background,
@@ -34,7 +34,7 @@ from benchmarks.thresholds import (
     render,
     sampling,
 )
-from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar, Steerable
+from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar
 from torch_vdm.cortex import Cortex, Transform, bands
 from torch_vdm.masking import masking_energy, signed_transducer
 from torch_vdm.pooling import covering, phase_energy, pool_halves, surround_halves
@@ -45,9 +45,7 @@ MECHANISMS = ("achromatic", "red-green", "yellow-violet", "mixed")
 
 # The rungs that are fitted, by the name that tables give them.
 RUNGS: dict[str, Transform] = {
-    "fast": Haar(),
-    "standard": StationaryHaar("filter"),
-    "reference": Steerable(),
+    **people.RUNGS,
     "stationary": StationaryHaar(),
     "filtered": Haar("filter"),
 }
@@ -103,7 +101,6 @@ ZONES = 2
 # Levels that are looked at, from the finest.
 LEVELS = 9
 
-DECIBELS = 20.0 / math.log(10.0)
 Array = NDArray[np.float64]
 
 
@@ -471,10 +468,7 @@ def fit(
     for _ in range(1 if noise is None else times):
         seen, rises = 0.0, np.zeros(len(names))
         if noise is not None:
-            seen = noise(logs)
-            rises = (
-                np.array([noise(logs + step) - seen for step in STEP * np.eye(len(names))]) / STEP
-            )
+            seen, rises = _tangent(noise, logs)
         around = torch.tensor(logs), seen, torch.tensor(rises)
 
         def evaluate(logs: Array, around: Any = around) -> Array:
@@ -491,6 +485,13 @@ def fit(
     covariance = np.linalg.inv(found.jac.T @ found.jac) * np.mean(found.fun**2)
     values = {name: float(np.exp(value)) for name, value in zip(names, found.x, strict=True)}
     return values, dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+
+
+def _tangent(noise: Noise, about: Array) -> tuple[float, Array]:
+    """Return a noise at some parameters, and its slopes by their logarithms."""
+    seen = noise(about)
+    rises = [noise(about + step) - seen for step in STEP * np.eye(len(about))]
+    return seen, np.array(rises) / STEP
 
 
 def noise_of(observer: Observer, transform: Transform, every: int = ZONES) -> Noise | None:
@@ -706,8 +707,7 @@ def rung(
 
 def _straight(noise: Noise, about: Array) -> Noise:
     """Return a noise that rises in a straight line, as it does at some parameters."""
-    seen = noise(about)
-    rises = np.array([noise(about + step) - seen for step in STEP * np.eye(len(about))]) / STEP
+    seen, rises = _tangent(noise, about)
     return lambda logs: float(seen + rises @ (logs - about))
 
 
