@@ -7,6 +7,7 @@ from typing import Any, Literal, Self
 import torch
 from torch import Tensor, nn
 
+from torch_vdm import operators
 from torch_vdm.display import Display
 from torch_vdm.distance import just_noticeable
 from torch_vdm.observer import Observer
@@ -84,6 +85,7 @@ class VDMLoss(nn.Module):
         self.metric._checkpointed = bool(checkpoint)
         self.l1 = l1
         self.reduction = reduction
+        self._number = operators.enrol(self)
 
     def forward(self, test: Tensor, reference: Tensor, mask: Tensor | None = None) -> Tensor:
         """Return the loss of (B, 3, H, W) against (B, 3, H, W).
@@ -91,16 +93,28 @@ class VDMLoss(nn.Module):
         ``mask`` (B, 1, H, W) weights the pixels, 0 to leave one out; a pixel that is left out
         still is what its neighbours are seen against.
         """
+        if operators.is_wanted() and not (mask is not None and mask.requires_grad):
+            items = operators.loss_of_items(test, reference, mask, self._number)
+        else:
+            items = self.of_items(test, reference, mask)
+        if self.reduction == "mean":
+            return items.mean()
+        return items.sum() if self.reduction == "sum" else items
+
+    def of_items(self, test: Tensor, reference: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Return the loss of every item, (B,); arguments as `forward`."""
         test, reference, seen = self.metric._checked(test, reference)
         # The L1 term first: what it needs on the way is gone when the metric needs most.
         l1 = self.l1 * self.metric._in_rows(self._absolute, test, reference) if self.l1 else 0.0
         power = self.metric._power(test, reference, seen)
         exponent = self.metric.observer.summation_exponent / EXPONENT
         plane = torch.log1p(just_noticeable(power, power.new_tensor(exponent))) + l1
-        items = _mean(plane, mask)
-        if self.reduction == "mean":
-            return items.mean()
-        return items.sum() if self.reduction == "sum" else items
+        return _mean(plane, mask)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state of another, of which this is a copy."""
+        super().__setstate__(state)  # type: ignore[no-untyped-call]  # torch's own, without types
+        self._number = operators.enrol(self)
 
     def compile(self, *args: Any, **kwargs: Any) -> Self:  # type: ignore[override]
         """Switch the metric to its fast route, `VDM.compile`."""

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch._subclasses.fake_tensor import is_fake
 from torch.utils.checkpoint import checkpoint
 
+from torch_vdm import operators
 from torch_vdm.display import Display
 from torch_vdm.distance import just_noticeable
 from torch_vdm.fast import for_any_size
@@ -50,7 +51,13 @@ class PairMetric(nn.Module):
         self.nonfinite = nonfinite
         self._fast = False
         self._checkpointed = False
+        self._number = operators.enrol(self)
         keep_freed_memory()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state of another, of which this is a copy."""
+        super().__setstate__(state)  # type: ignore[no-untyped-call]  # torch's own, without types
+        self._number = operators.enrol(self)
 
     def _kept(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a part of the forward pass, of which a checkpoint keeps the arguments alone.
@@ -91,9 +98,9 @@ class PairMetric(nn.Module):
     def compile(self, *args: Any, **kwargs: Any) -> Self:  # type: ignore[override]
         """Switch to the fast route: one compiled function a level, for any size and batch.
 
-        Unlike ``torch.compile(metric)``, which compiles the graph of all levels anew for each
-        size. Takes no arguments; returns the module itself, where `nn.Module.compile` returns
-        nothing. Needs a C++ compiler.
+        ``torch.compile(metric)``, or of a step that calls it, does not: there the metric is one
+        operator, which takes the route that it takes elsewhere. Takes no arguments; returns the
+        module itself, where `nn.Module.compile` returns nothing. Needs a C++ compiler.
         """
         if args or kwargs:
             raise ValueError("expected no arguments: the fast route has no options")
@@ -113,6 +120,8 @@ class PairMetric(nn.Module):
         Tensor
             (B, 1, H, W), JND.
         """
+        if operators.is_wanted():
+            return operators.difference_map(test, reference, self._number, power=False)
         test, reference, seen = self._checked(test, reference)
         total = self._total(test, reference)
         constants = self._constants(total.dtype, "summation_exponent")
@@ -127,6 +136,8 @@ class PairMetric(nn.Module):
         (B, 1, H, W), from (B, 3, H, W) twice. Smooth where the images are equal, so that a loss
         is taken from here; see `VDMLoss`.
         """
+        if operators.is_wanted():
+            return operators.difference_map(test, reference, self._number, power=True)
         return self._power(*self._checked(test, reference))
 
     def _power(self, test: Tensor, reference: Tensor, seen: Tensor | None) -> Tensor:

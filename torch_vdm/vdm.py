@@ -112,7 +112,7 @@ class VDM(TiledMetric):
         What is simulated; everything by default.
     nonfinite
         "raise": NaN or infinity in an image is a ValueError that names the batch item (a graph
-        of torch.compile cannot raise: there it gives NaN). To know, one number an image is read
+        of torch.export cannot raise: there it gives NaN). To know, one number an image is read
         back from the device, and nothing else ever is. "mask": such pixels are taken as equal in
         both images, and the map is 0 there; nothing is read back.
 
