@@ -89,15 +89,15 @@ MIXED_WEIGHT, OUTLIER, SPREAD = 0.3, 8.0, 3.0
 # against one row. Status: choice: less of the first lets the fit trade a mechanism's absolute
 # sensitivity, which is what 1 JND means, for the shape of another; the second divides between
 # gratings and noise what no observer of these parameters has of both.
-ANCHOR, NOISE = 90.0, 150.0
+ANCHOR, NOISE = 90.0, 300.0
 
-# Times that the noise is computed anew with its slopes by the parameters, and their step.
-TIMES, STEP = 3, 0.1
+# The step of a parameter's logarithm for the slopes of the noise.
+STEP = 0.1
 
 # Evaluations of a fit that begins near where it ends.
 IN_FOLDS = 10
 
-# Every so many zones are fitted; all are judged.
+# Every so many zones are fitted, and of these every so many in a fold; all are judged.
 ZONES = 2
 
 # Levels that are looked at, from the finest.
@@ -427,18 +427,21 @@ def robust(residual: Tensor) -> Tensor:
 Noise = Callable[[Array], float]
 
 
+def _no_noise(logs: Array) -> float:
+    del logs
+    return 0.0
+
+
 def fit(
     model: Model | FormulaModel,
     start: dict[str, float],
     evaluations: int = 25,
     spread: float = SPREAD,
-    noise: Noise | None = None,
-    times: int = TIMES,
+    noise: Noise = _no_noise,
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return the fitted parameters and the standard deviation of their logarithms.
 
-    ``spread`` is the rms of the data in dB: how much the beliefs of `FREE` weigh against it. The
-    noise is computed anew, with its slopes, so many ``times``.
+    ``spread`` is the rms of the data in dB: how much the beliefs of `FREE` weigh against it.
     """
     from scipy.optimize import least_squares
 
@@ -457,33 +460,24 @@ def fit(
     centre = torch.tensor([math.log(FREE[name][0]) for name in names])
     width = torch.tensor([FREE[name][1] for name in names]).double()
 
-    def terms(logs: Tensor, about: Tensor, seen: float, rises: Tensor) -> Tensor:
+    def terms(logs: Tensor) -> Tensor:
         free = {name: torch.exp(value) for name, value in zip(names, logs, strict=True)}
         residual = model.residual(free)
         means = mean_of.T @ residual
         within = robust(residual - share @ means) * weight
         held = ANCHOR**0.5 * (anchors @ means) / anchors.sum(1)
-        noisy = NOISE**0.5 * (seen + (rises * (logs - about)).sum())
-        return torch.cat((within, held, noisy[None], spread * (logs - centre) / width))
+        return torch.cat((within, held, spread * (logs - centre) / width))
 
-    logs = np.log([start[name] for name in names])
-    for _ in range(1 if noise is None else times):
-        seen, rises = 0.0, np.zeros(len(names))
-        if noise is not None:
-            seen, rises = _tangent(noise, logs)
-        around = torch.tensor(logs), seen, torch.tensor(rises)
+    def evaluate(logs: Array) -> Array:
+        with torch.no_grad():
+            return np.append(terms(torch.tensor(logs)), noise(logs) * NOISE**0.5)
 
-        def evaluate(logs: Array, around: Any = around) -> Array:
-            with torch.no_grad():
-                return np.asarray(terms(torch.tensor(logs), *around))
+    def slopes(logs: Array) -> Array:
+        rows = jacfwd(terms)(torch.tensor(logs)).detach()
+        return np.vstack((rows, _tangent(noise, logs)[1] * NOISE**0.5))
 
-        def slopes(logs: Array, around: Any = around) -> Array:
-            return np.asarray(jacfwd(terms)(torch.tensor(logs), *around).detach())
-
-        found = least_squares(
-            evaluate, logs, jac=slopes, max_nfev=evaluations, xtol=1e-4, ftol=1e-5
-        )
-        logs = found.x
+    begin = np.log([start[name] for name in names])
+    found = least_squares(evaluate, begin, jac=slopes, max_nfev=evaluations, xtol=1e-4, ftol=1e-5)
     covariance = np.linalg.inv(found.jac.T @ found.jac) * np.mean(found.fun**2)
     values = {name: float(np.exp(value)) for name, value in zip(names, found.x, strict=True)}
     return values, dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
@@ -496,11 +490,11 @@ def _tangent(noise: Noise, about: Array) -> tuple[float, Array]:
     return seen, np.array(rises) / STEP
 
 
-def noise_of(observer: Observer, transform: Transform, every: int = ZONES) -> Noise | None:
-    """Return the `Noise` of SIN3D's zones; None where the data is not there."""
+def noise_of(observer: Observer, transform: Transform, every: int = ZONES) -> Noise:
+    """Return the `Noise` of SIN3D's zones; of none where the data is not there."""
     some = zones()[::every]
     if not some:
-        return None
+        return _no_noise
 
     def noise(logs: Array) -> float:
         changed: Any = dict(zip(FREE, np.exp(logs).tolist(), strict=True))
@@ -535,14 +529,14 @@ def left_out(
     thresholds: list[Threshold],
     folds: NDArray[np.int64],
     start: dict[str, float],
-    noise: Noise | None = None,
+    noise: Noise = _no_noise,
 ) -> dict[str, float]:
     """Return the rms of rows that the fit did not see, one gain a study and mechanism."""
     residual = np.full(len(thresholds), np.nan)
     for fold in sorted(set(folds.tolist()) - {-1}):
         inside = [t for t, f in zip(thresholds, folds, strict=True) if f != fold]
         outside = [t for t, f in zip(thresholds, folds, strict=True) if f == fold]
-        values, _ = fit(make(inside), start, IN_FOLDS, noise=noise, times=1)
+        values, _ = fit(make(inside), start, IN_FOLDS, noise=noise)
         residual[folds == fold] = predicted(make(outside), values)
     seen = folds >= 0
     some = [t for t, s in zip(thresholds, seen, strict=True) if s]
@@ -680,7 +674,7 @@ def rung(
     def drawn(some: list[Threshold]) -> Model:
         return Model(observer, some, DRAWINGS[:1], transform)
 
-    noise = None if quick else noise_of(observer, transform)
+    noise = _no_noise if quick else noise_of(observer, transform)
     model = Model(observer, used, drawings, transform)
     values, deviations = fit(model, start, 6 if quick else 30, noise=noise)
     residual = predicted(model, values)
@@ -700,9 +694,8 @@ def rung(
         "gains": study_gains(residual, used),
     }
     if not quick:
-        # The noise rises with the parameters as it does where all is fitted.
-        noise = None if noise is None else _straight(noise, np.log(list(values.values())))
-        one, _ = fit(drawn(used), values, IN_FOLDS, noise=noise, times=1)
+        noise = noise_of(observer, transform, ZONES * ZONES)
+        one, _ = fit(drawn(used), values, IN_FOLDS, noise=noise)
         result["one_drawing"] = by_mechanism(centred(predicted(drawn(used), one), used), used)
         folds = five_folds(used), studies(used)
         result["five_folds"] = left_out(drawn, used, folds[0], values, noise)
@@ -717,12 +710,6 @@ def rung(
     whole = whole_metric(fitted, some, residual[::every], *DRAWINGS[0], transform=transform)
     result["whole_metric"] = by_mechanism(centred(whole, some), some)
     return result
-
-
-def _straight(noise: Noise, about: Array) -> Noise:
-    """Return a noise that rises in a straight line, as it does at some parameters."""
-    seen, rises = _tangent(noise, about)
-    return lambda logs: float(seen + rises @ (logs - about))
 
 
 def study_gains(residual: Array, thresholds: list[Threshold]) -> dict[str, float]:
