@@ -15,6 +15,7 @@ BENCHMARKS = {
     "overhead": "what deciding costs beside rendering; 10 minutes, 10 seconds with --quick",
     "paper": "Figures 9 to 14, and real scenes; 2 hours, 30 seconds with --quick",
     "people": "what people saw of noise, masks, quantisation; 5 minutes, 30 seconds with --quick",
+    "pictures": "what each transform says of pictures; 1 minute, 10 seconds with --quick",
     "speed": "time and memory beside kornia's SSIM; 6 minutes, 1 with --quick",
     "stability": "hard images in every precision; 10 minutes, 15 seconds with --quick",
     "stopping": "whether the sampler stops honestly; 30 minutes, 10 seconds with --quick",

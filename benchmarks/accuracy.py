@@ -6,7 +6,6 @@ best; what counts is the rms by mechanism. The two parts, errors and times, are 
 replaces its own half of accuracy.json, so that times can be taken on a quiet machine.
 """
 
-import io
 import json
 import math
 import statistics
@@ -26,7 +25,7 @@ from benchmarks import record
 from benchmarks.calibrate import HIGHEST_CONTRAST, MECHANISMS, by_mechanism, centred
 from benchmarks.daly import PSYCHOMETRIC, detection_probability
 from benchmarks.peers import Peer, clipped, installed
-from benchmarks.places import shared_data
+from benchmarks.pictures import distorted, photographs
 from benchmarks.speed import images, peak_megabytes
 from benchmarks.thresholds import Threshold, pattern, read_thresholds, render, sampling
 from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar
@@ -56,6 +55,9 @@ SUREST = 1.0 - 2.0**-53
 PPD, WHITE = 64.0, 200.0
 FREQUENCIES = (1.0, 2.0, 3.0, 4.0, 5.0, 8.0, 11.3)
 PHASES = 4
+
+# Those by which maps are compared with Sarnoff's.
+DISTORTIONS = ("noise", "blur", "JPEG", "grating")
 
 FULL_HD = (1080, 1920)
 THREADS = 2
@@ -251,27 +253,10 @@ def pictures(quick: bool) -> dict[str, tuple[Tensor, Tensor]]:
     """Return pairs of test and reference, sRGB-coded (1, 3, H, W): photographs and a scene."""
     # Without the shared photographs the scene alone is judged.
     pairs: dict[str, tuple[Tensor, Tensor]] = {}
-    from PIL import Image
-
     generator = torch.Generator().manual_seed(1)
-    y, x = torch.meshgrid(*2 * (torch.arange(256.0),), indexing="ij")
-    for path in sorted((shared_data() / "ldr").glob("*.png"))[: 1 if quick else 5]:
-        array = np.asarray(Image.open(path).convert("RGB"), dtype=np.float32)[100:356, 100:356]
-        photo = torch.from_numpy(array / 255.0).permute(2, 0, 1)[None]
-        noise = 0.02 * torch.randn(photo.shape, generator=generator)
-        kernel = torch.full((3, 1, 3, 3), 1.0 / 9.0)
-        blurred = torch.nn.functional.conv2d(photo, kernel, padding=1, groups=3)
-        file = io.BytesIO()
-        Image.fromarray(array.astype(np.uint8)).save(file, "JPEG", quality=40)
-        jpeg = np.asarray(Image.open(file), dtype=np.float32) / 255.0
-        wave = 0.02 * torch.sin(2.0 * math.pi * (x / 8.0 + y / 19.0))
-        for name, test in (
-            ("noise", photo + noise),
-            ("blur", blurred),
-            ("JPEG", torch.from_numpy(jpeg).permute(2, 0, 1)[None]),
-            ("grating", photo + wave),
-        ):
-            pairs[f"{name}, {path.stem}"] = (test.clamp(0.0, 1.0), photo)
+    for name, photo in photographs(1 if quick else 5).items():
+        tests = distorted(photo, generator)
+        pairs |= {f"{kind}, {name}": (tests[kind], photo) for kind in DISTORTIONS}
     scene = chapel(generator)
     noise = 0.04 * torch.randn(scene.shape, generator=generator)
     pairs["chapel"] = ((scene + noise).clamp(0.0, 1.0), scene)
