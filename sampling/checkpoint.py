@@ -34,7 +34,6 @@ WORDS = {
     "ppd": "--ppd",
     "white": "--white",
     "observer": "--observer",
-    "effects": "--effects",
     "aov": "--aov",
 }
 
@@ -73,10 +72,12 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         "arrays": sorted(arrays),
         "values": {name: v for name, v in checkpoint.state.items() if name not in arrays},
     }
-    # Always the same name: whoever is killed while he writes leaves one file, not many.
+    # Always the same name: whoever is killed while he writes leaves one file, not many. What lies
+    # there is never written to: it may be a link to something else.
     temporary = path.with_name(f".{path.name}.partial")
     try:
-        with temporary.open("wb") as file:
+        temporary.unlink(missing_ok=True)
+        with temporary.open("xb") as file:
             entries: dict[str, Any] = {_ARRAY + name: array for name, array in arrays.items()}
             entries[_HEADER] = np.array(json.dumps(header))
             np.savez(file, **entries)

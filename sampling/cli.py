@@ -162,21 +162,27 @@ class _Progress:
 
 
 class _Interrupt:
-    """Counts Ctrl-C: the first ends the run after its round, the second at once."""
+    """Counts Ctrl-C: the first ends the run after its round, the second at once.
+
+    A request to terminate, as of a cluster's scheduler, ends it at once too. What there is is
+    written whole all the same; a third Ctrl-C gives that up.
+    """
 
     def __init__(self) -> None:
         self.count = 0
 
     def __enter__(self) -> "_Interrupt":
-        self._before = signal.signal(signal.SIGINT, self._note)
+        kinds = signal.SIGINT, signal.SIGTERM
+        self._before = {kind: signal.signal(kind, self._note) for kind in kinds}
         return self
 
     def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGINT, self._before)
+        for kind, handler in self._before.items():
+            signal.signal(kind, handler)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        self.count += 1
-        if self.count == 3:
+        self.count = max(2, self.count) if number == signal.SIGTERM else self.count + 1
+        if self.count >= 3:
             signal.default_int_handler(number, frame)
 
 
@@ -268,7 +274,8 @@ class _Job:
             "samples_total": progress.samples,
             "spp_mean": progress.samples / (height * width),
             "predicted_max_jnd": report.predicted if report is not None else None,
-            "visible_fraction": report.over if report is not None else None,
+            "visible_fraction": report.visible if report is not None else None,
+            "over_tolerance_fraction": report.over if report is not None else None,
             # A pixel without a finite sample is black, and nothing is known of it.
             "converged": report is not None and report.converged and not empty,
             "stop_reason": reason,
@@ -327,7 +334,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         "size": f"{width} x {height}",
         "scene": renderer.fingerprint,
         **{name: getattr(options, name) for name in ("seed", "ppd", "white", "observer")},
-        **{name: getattr(options, name) for name in ("effects", "aov")},
+        "aov": options.aov,
     }
     kept = options.checkpoint or options.output.with_name(f"{options.output.name}.checkpoint")
     sampler = _resumed(kept, identity, metric, renderer, progress) if options.resume else None
@@ -335,12 +342,12 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         options, renderer, sampler or Sampler(renderer.size, metric, settings), progress, identity
     )
     few = height * width < FEW_PIXELS
-    with _threads(1 if few else torch.get_num_threads()):
-        with _Interrupt() as interrupt, _live(options) as line:
+    with _threads(1 if few else torch.get_num_threads()), _Interrupt() as interrupt:
+        with _live(options) as line:
             reason = job.render(interrupt, line)
         job.write()
-    if options.checkpoint or reason == "interrupted":
-        job.save(kept)
+        if options.checkpoint or reason == "interrupted":
+            job.save(kept)
     figures = job.figures(reason)
     if options.json == "-":
         tell(json.dumps(figures, indent=2) + "\n")

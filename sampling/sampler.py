@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from sampling.prediction import Model
@@ -17,6 +18,7 @@ from sampling.statistics import FIRST, PIECE, SECOND, Statistics
 from sampling.strategies import LARGEST_GROWTH, SMALLEST_GROWTH, STRATEGIES, HalfBuffer
 from sampling.variance import pooled_covariance
 from torch_vdm import VDM, Haar
+from torch_vdm.distance import VISIBLE
 from torch_vdm.quadtree import push
 
 Plane = NDArray[np.float64]
@@ -25,7 +27,7 @@ StopReason = Literal["tolerance", "noise_threshold", "max_spp"]
 StrategyName = Literal["perceptual", "objective", "uniform", "halfbuffer"]
 
 # What `state` is made of. Raised when an older state would be continued differently.
-STATE_VERSION = 5
+STATE_VERSION = 6
 
 # Share of the tolerance that a round aims at, for a prediction is not exact. Status: choice.
 AIM = 0.98
@@ -147,6 +149,8 @@ class Report(NamedTuple):
     """Largest visible difference from the converged image, in JND: not exceeded with 95 %."""
     over: float
     """Share of pixels that are predicted over the tolerance, 0 to 1."""
+    visible: float
+    """Share of pixels that are predicted over 1 JND, 0 to 1."""
     jnd: NDArray[np.float64]
     """(H, W), the predicted map, in JND; its maximum is ``predicted``."""
     forecast: int
@@ -181,7 +185,8 @@ class Sampler:
     Raises
     ------
     ValueError
-        Where the size has a 0, or the metric's display is not linear, or its transform not `Haar`.
+        Where the size has a 0, or the metric's display is not linear, its transform not `Haar`, or
+        it is not on the CPU.
     """
 
     def __init__(
@@ -193,6 +198,10 @@ class Sampler:
             raise ValueError("expected a metric with a linear display, got sRGB-coded values")
         if metric.transform != Haar():
             raise ValueError(f"expected a metric on Haar(), got {metric.transform}")
+        if (device := metric.summation_exponent.device.type) != "cpu":
+            raise ValueError(
+                f"expected a metric on the CPU, got one on {device}; move a copy there"
+            )
         self.size = (int(size[0]), int(size[1]))
         self.metric = metric
         self.settings = settings or Settings()
@@ -218,7 +227,20 @@ class Sampler:
         return Request(pixels, (statistics.first + statistics.drawn)[pixels], left[pixels])
 
     def tell(self, samples: Samples) -> None:
-        """Fold in samples: the parts of what was asked, in order."""
+        """Fold in samples: the parts of what was asked, in order.
+
+        Raises
+        ------
+        ValueError
+            Where a pixel has more samples than it was asked for, as when a part is told twice.
+        """
+        told = np.bincount(samples.pixels, minlength=len(self._target))
+        if len(told) > len(self._target) or (told > self._left()).any():
+            pixel = int(np.argmax(told[: len(self._target)] > self._left()))
+            raise ValueError(
+                f"expected the samples that were asked for, got too many of pixel {pixel}; "
+                "tell each part once"
+            )
         self._statistics.add(samples)
 
     def report(self) -> Report | None:
@@ -294,8 +316,13 @@ class Sampler:
         most = self.settings.max_spp
         return most // 2 if most is not None and self.settings.unbiased else most
 
+    @torch.inference_mode(False)
+    @torch.enable_grad()
     def _decide(self) -> None:
-        """End a round: predict, then stop, or say how many samples every pixel is to have."""
+        """End a round: predict, then stop, or say how many samples every pixel is to have.
+
+        Placement takes derivatives, whatever the caller has switched off.
+        """
         statistics = self._statistics
         model = Model(self.metric, statistics, self.size)
         predicted = model.predicted_maximum(self.settings.tolerance)
@@ -342,6 +369,7 @@ class Sampler:
             spp=drawn / len(self._target),
             predicted=predicted,
             over=float((jnd > self.settings.tolerance).mean()),
+            visible=float((jnd > VISIBLE).mean()),
             jnd=jnd,
             forecast=forecast,
             nonfinite=int(statistics.nonfinite.sum()),

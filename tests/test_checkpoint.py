@@ -128,3 +128,12 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) 
     with pytest.raises(CheckpointError, match="cannot be written"):
         checkpoint.save(path, Checkpoint(IDENTITY, {"a": 2}))
     assert checkpoint.load(path, IDENTITY)["a"] == 1
+
+
+def test_a_link_in_the_way_is_not_written_through(tmp_path: Path) -> None:
+    path, other = tmp_path / "run", tmp_path / "other"
+    other.write_text("kept")
+    (tmp_path / ".run.partial").symlink_to(other)
+    checkpoint.save(path, Checkpoint(IDENTITY, {"a": 1}))
+    assert other.read_text() == "kept"
+    assert checkpoint.load(path, IDENTITY)["a"] == 1

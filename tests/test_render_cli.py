@@ -21,7 +21,7 @@ from sampling import Samples, cli
 from sampling.cli import main
 from sampling.renderers.llvm import LLVMError, find_llvm
 from sampling.renderers.mitsuba import MitsubaRenderer, SceneError, load_mitsuba
-from torch_vdm.io import load
+from torch_vdm.io import load, write_channels
 
 # FACE.md: what acceptance reads.
 KEYS = {
@@ -102,6 +102,8 @@ def test_the_image_and_the_figures(whole: tuple[list[str], Path]) -> None:
     assert told["spp_mean"] == pytest.approx(told["samples_total"] / (12 * 8))
     assert planes["samples"].min() < planes["samples"].max()
     assert planes["jnd"].max() == pytest.approx(told["predicted_max_jnd"])
+    assert told["visible_fraction"] == (planes["jnd"] > 1.0).mean()
+    assert told["over_tolerance_fraction"] == (planes["jnd"] > told["tolerance"]).mean()
     assert all((planes[f"variance.{name}"] > 0.0).any() for name in "RGB")
     np.testing.assert_array_equal(
         load(output).pixels.numpy(), np.stack([planes[name] for name in "RGB"])
@@ -188,7 +190,23 @@ def test_ctrl_c_ends_the_round_and_says_how_to_go_on(
     assert resumed["seconds_total"] > told["seconds_total"]
 
 
-@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGINT])
+def test_ctrl_c_while_the_picture_is_written_loses_nothing(
+    whole: tuple[list[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments, wanted = whole
+    output, kept = tmp_path / "out.exr", tmp_path / "run.checkpoint"
+
+    def interrupted(*picture: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        write_channels(*picture)
+
+    monkeypatch.setattr(cli, "write_channels", interrupted)
+    assert main([*arguments, "--output", str(output), "--checkpoint", str(kept)]) == 0
+    same_image(output, wanted)
+    assert kept.is_file()
+
+
+@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_a_process_that_is_ended_is_resumed_to_the_same_image(
     whole: tuple[list[str], Path], tmp_path: Path, blow: signal.Signals
 ) -> None:
@@ -210,7 +228,7 @@ def test_a_process_that_is_ended_is_resumed_to_the_same_image(
             time.sleep(0.002)
         child.send_signal(blow)
         _, said = child.communicate(timeout=120)
-    if blow == signal.SIGINT:
+    if blow != signal.SIGKILL:
         assert child.returncode == 130
         assert "go on with: vdm-render" in said
         assert output.exists()
@@ -231,7 +249,10 @@ def test_a_checkpoint_of_another_run_is_refused(
     capsys.readouterr()
     for change, words in (
         ((), "begun with --max-spp 16, and this is None"),
-        (("--max-spp", "16", "--seed", "8"), "begun with --seed 7, and this is 8"),
+        (
+            ("--max-spp", "16", "--seed", "8", "--effects", "full"),
+            "begun with --seed 7, and this is 8",
+        ),
         (("--max-spp", "16", "-D", "depth=3"), "another scene"),
         (("--max-spp", "16", "-D", "width=13"), "begun with image size 12 x 8"),
     ):
