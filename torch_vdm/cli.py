@@ -10,7 +10,7 @@ import shlex
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.resources import as_file, files
@@ -29,14 +29,24 @@ from torch_vdm.display import (
     encode_srgb,
     pixels_per_degree,
 )
-from torch_vdm.io import ArrayFile, ImageError, atomic_path, check_target, load, write_image
+from torch_vdm.io import (
+    ArrayFile,
+    Image,
+    ImageError,
+    atomic_path,
+    check_target,
+    load,
+    write_image,
+)
+from torch_vdm.io.alpha import colour
 from torch_vdm.io.arrays import MAGIC
+from torch_vdm.io.refusal import printable
 from torch_vdm.observer import Observer
 from torch_vdm.report import BAND, Comparison, figures, shrunk, table, write_heat_map
 from torch_vdm.tiling import SMALLEST_TILE, TILE, Source, read
 from torch_vdm.vdm import VDM
 
-DONE, EXCEEDED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+DONE, EXCEEDED, BAD_INPUT, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130
 
 # Assumed where nothing is given; each is printed. Status: choice. 60 pixels per degree is a
 # 27-inch screen of 3840 x 2160 from 0.53 m; 100 cd/m2 is the white of BT.1886 and Display.srgb.
@@ -85,28 +95,74 @@ class Parser(argparse.ArgumentParser):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``torch-vdm``; return its exit status."""
-    options = _parser().parse_args(arguments)
-    return run("torch-vdm", lambda: _command(options))
+    return run("torch-vdm", lambda: _command(parsed(_parser(), arguments)))
 
 
-def run(program: str, command: Callable[[], int]) -> int:
+def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Return the options; help and version are printed, whether or not anybody reads them."""
+    try:
+        return parser.parse_args(arguments)
+    except SystemExit:
+        tell("")
+        raise
+
+
+def run(
+    program: str,
+    command: Callable[[], int],
+    refusals: tuple[type[ValueError], ...] = (ImageError, UsageError),
+) -> int:
     """Run a command; return its exit status, for an error after one line that begins with its name.
 
-    ``command`` returns the status of a run without an error.
+    ``command`` returns the status of a run without an error; ``refusals`` are the errors that mean
+    bad input. All others are the program's own: 3, and never 1, which says that something was
+    exceeded.
     """
+    _keep_standard_numbers()
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A file's name may have letters that the terminal lacks.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         return command()
-    except ValueError as error:  # of the library, one line each; ImageError is one
+    except refusals as error:  # of the library, one line each
         print(f"{program}: {error}", file=sys.stderr)
+        return BAD_INPUT
     except OSError as error:
         print(f"{program}: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
+        return BAD_INPUT
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
         return INTERRUPTED
-    return BAD_INPUT
+    except Exception as error:
+        print(f"{program}: {_internal(error)}", file=sys.stderr)
+        return INTERNAL
+
+
+def _internal(error: Exception) -> str:
+    """One line for an error that is not the user's."""
+    text = printable(" ".join(str(error).split()))
+    # PyTorch says so in words.
+    if isinstance(error, MemoryError) or ("alloc" in text and "memory" in text):
+        why = text if isinstance(error, MemoryError) and text else "not enough memory"
+        return f"{why}; make the images smaller, or compare in tiles (--tile {TILE})"
+    return f"internal error, {type(error).__name__}: {text}; please report it with the images"
+
+
+def _keep_standard_numbers() -> None:
+    """Let no file that is opened later take the number of a closed standard stream."""
+    number = os.open(os.devnull, os.O_RDWR)
+    while number <= 2:
+        number = os.open(os.devnull, os.O_RDWR)
+    os.close(number)
+
+
+@contextlib.contextmanager
+def _usage() -> Iterator[None]:
+    """Take a value that the model refuses for what it is: an option."""
+    try:
+        yield
+    except ValueError as error:
+        raise UsageError(str(error)) from error
 
 
 def _command(options: argparse.Namespace) -> int:
@@ -127,8 +183,9 @@ def _parser() -> argparse.ArgumentParser:
     compare = commands.add_parser(
         "compare",
         help="compare a test image with a reference",
-        description="Compare two images of one size, PNG, JPEG, EXR or NPY, in just-noticeable "
-        "differences. Exit status: 0 done, 1 --fail-above exceeded, 2 bad input.",
+        description="Compare two images of one size in just-noticeable differences: EXR, PNG, "
+        "JPEG, HDR, PFM, TIFF, WebP, BMP, PNM, TGA, GIF, AVIF or NPY. Exit status: 0 done, "
+        "1 --fail-above exceeded, 2 bad input, 3 internal error or not enough memory.",
     )
     compare.add_argument("reference", type=Path, metavar="REFERENCE")
     compare.add_argument("test", type=Path, metavar="TEST")
@@ -157,14 +214,14 @@ def _add_options(parser: argparse.ArgumentParser, map_path: Path | None) -> None
         type=positive,
         default=WHITE,
         metavar="CD_M2",
-        help=f"luminance of white in PNG and JPEG ({WHITE:g})",
+        help=f"luminance of white in sRGB-coded files, PNG and JPEG among them ({WHITE:g})",
     )
     light.add_argument(
         "--white",
         type=positive,
         default=WHITE,
         metavar="CD_M2",
-        help=f"luminance of 1.0 in EXR ({WHITE:g})",
+        help=f"luminance of 1.0 in files of light, EXR among them ({WHITE:g})",
     )
     light.add_argument(
         "--exposure", type=_stops, default=0.0, metavar="STOPS", help="multiply the light by 2^F"
@@ -186,9 +243,42 @@ def _add_options(parser: argparse.ArgumentParser, map_path: Path | None) -> None
         f"{TILE} over {LARGEST_WHOLE / 1e6:.0f} megapixels, below none",
     )
     reading = parser.add_argument_group("reading")
-    reading.add_argument("--part", metavar="NAME", help="part of a multi-part EXR, name or number")
-    reading.add_argument("--nonfinite", choices=("raise", "zero"), default="raise")
-    reading.add_argument("--negative", choices=("raise", "clip", "keep"), default="raise")
+    reading.add_argument(
+        "--part",
+        metavar="NAME",
+        help="part, layer or view of an EXR: a name, its last word, or a number",
+    )
+    reading.add_argument(
+        "--channels",
+        type=_channels,
+        metavar="R=...,G=...,B=...",
+        help="the channels of an EXR to take",
+    )
+    reading.add_argument(
+        "--background",
+        type=_background,
+        metavar="COLOUR",
+        help="behind transparent images: black, white, grey or #rrggbb (black, and white too where "
+        "the transparency of the two differs)",
+    )
+    reading.add_argument(
+        "--coded",
+        action="store_true",
+        help="floating-point values are sRGB-coded, not light",
+    )
+    reading.add_argument(
+        "--nonfinite",
+        choices=("raise", "zero", "clamp"),
+        default="raise",
+        help="NaN and infinity: refused (default); 0; or infinity as the largest value of the "
+        "channel's type and NaN as its neighbours' mean",
+    )
+    reading.add_argument(
+        "--negative",
+        choices=("raise", "clip", "keep"),
+        default="raise",
+        help="negative light in the file: refused (default), 0, or kept",
+    )
     output = parser.add_argument_group("output")
     output.add_argument(
         "--map", type=_map_path, default=map_path, metavar="OUT.png|OUT.exr", help="the heat map"
@@ -206,7 +296,6 @@ class _Pair:
     reference: Source
     test: Source
     display: Display
-    assumptions: list[str]
 
     @property
     def size(self) -> tuple[int, int]:
@@ -259,27 +348,32 @@ class _Linear:
 
 
 def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
-    # For the map of a large image; one that cannot be removed is not worth a failure.
-    with tempfile.TemporaryDirectory(prefix="torch-vdm-", ignore_cleanup_errors=True) as room:
-        return _compare_with(Path(room), reference, test, options)
+    # For the maps of large images; one that cannot be removed is not worth a failure.
+    with contextlib.ExitStack() as rooms:
+        return _compare_with(rooms, reference, test, options)
 
 
-def _compare_with(room: Path, reference: Path, test: Path, options: argparse.Namespace) -> int:
+def _compare_with(
+    rooms: contextlib.ExitStack, reference: Path, test: Path, options: argparse.Namespace
+) -> int:
     check_outputs((reference, test), (options.map, json_path(options)))
-    ppd, seen_from = _viewing(options)
+    with _usage():
+        ppd, seen_from = _viewing(options)
+        displays = _displays(options)
     options.accuracy = options.accuracy or ACCURACY[options.observer]
-    pair = _load_pair(reference, test, options)
-    transform = TRANSFORMS[options.accuracy]()
-    metric = VDM(ppd, pair.display, OBSERVERS[options.observer](), transform)
+    pairs, assumptions = _load_pairs(reference, test, displays, options)
+    with _usage():
+        transform = TRANSFORMS[options.accuracy]()
+        metric = VDM(ppd, pairs[0].display, OBSERVERS[options.observer](), transform)
     tile = options.tile
-    if tile is None and math.prod(pair.size) > LARGEST_WHOLE:
+    if tile is None and math.prod(pairs[0].size) > LARGEST_WHOLE:
         tile = TILE
     start = time.perf_counter()
-    jnd = _in_tiles(metric, pair, tile, room) if tile else _whole(metric, pair)
+    jnd, pair = _largest(metric, pairs, tile, rooms)
     seconds = time.perf_counter() - start
     luminances = pair.luminances()
     told = figures(jnd)
-    assumptions = [seen_from, *pair.assumptions]
+    assumptions = [seen_from, *assumptions]
     if options.accuracy == "fast" and options.observer == "calibrated":
         assumptions.append(MAY_MISS)
     comparison = Comparison(
@@ -312,6 +406,19 @@ def _compare_with(room: Path, reference: Path, test: Path, options: argparse.Nam
     return EXCEEDED if exceeded else DONE
 
 
+def _largest(
+    metric: VDM, pairs: Sequence[_Pair], tile: int | None, rooms: contextlib.ExitStack
+) -> tuple[Tensor, _Pair]:
+    """Return the map (H, W) of the pairs' larger difference, and the pair that shows most."""
+    maps = [
+        _in_tiles(metric, pair, tile, rooms) if tile else _whole(metric, pair) for pair in pairs
+    ]
+    maxima = [jnd.max().item() for jnd in maps]
+    for other in maps[1:]:
+        torch.maximum(maps[0], other, out=maps[0])
+    return maps[0], pairs[maxima.index(max(maxima))]
+
+
 def _whole(metric: VDM, pair: _Pair) -> Tensor:
     """Return the map (H, W)."""
     height, width = pair.size
@@ -322,12 +429,14 @@ def _whole(metric: VDM, pair: _Pair) -> Tensor:
     return jnd
 
 
-def _in_tiles(metric: VDM, pair: _Pair, tile: int, room: Path) -> Tensor:
-    """Return the same, with a progress bar on a terminal; the map lies in a file in ``room``."""
+def _in_tiles(metric: VDM, pair: _Pair, tile: int, rooms: contextlib.ExitStack) -> Tensor:
+    """Return the same, with a progress bar on a terminal; the map lies in a file."""
     from rich.console import Console
     from rich.progress import Progress
 
     size = pair.size
+    folder = tempfile.TemporaryDirectory(prefix="torch-vdm-", ignore_cleanup_errors=True)
+    room = Path(rooms.enter_context(folder))
     jnd = torch.from_file(str(room / "map"), shared=True, size=math.prod(size)).view(1, *size)
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
@@ -365,7 +474,9 @@ def json_path(options: argparse.Namespace) -> Path | None:
 
 
 def tell(text: str) -> None:
-    """Print, and do not mind a reader that has read enough."""
+    """Print, and do not mind a reader that has read enough, or none at all."""
+    if sys.stdout is None:
+        return
     try:
         sys.stdout.write(text)
         sys.stdout.flush()
@@ -399,22 +510,31 @@ class _Opened(NamedTuple):
     """An image in memory, or an array on a disk, and what was assumed to read it."""
 
     pixels: Source
-    linear: bool
+    kind: str
+    content: str
     notes: tuple[str, ...]
+    image: Image | None
 
 
-def _open(path: Path, options: argparse.Namespace) -> _Opened:
+def _open(
+    path: Path, options: argparse.Namespace, view: str | None = None, background: str = "black"
+) -> _Opened:
     if _is_array(path):
-        array = ArrayFile(path, options.nonfinite, options.negative)
-        return _Opened(array, array.linear, array.notes)
+        array = ArrayFile(path, options.nonfinite, options.negative, options.coded)
+        return _Opened(array, "scene" if array.linear else "coded", "NPY", array.notes, None)
     image = load(
         path,
         part=_part(options.part),
+        view=view,
+        channels=options.channels,
         nonfinite=options.nonfinite,
         negative=options.negative,
+        background=options.background or background,
+        coded=options.coded,
         quiet=True,
     )
-    return _Opened(image.pixels, image.linear, image.notes)
+    content = image.content.replace("OpenEXR", "EXR")
+    return _Opened(image.pixels, image.kind, content, image.notes, image)
 
 
 def _is_array(path: Path) -> bool:
@@ -426,32 +546,123 @@ def _is_array(path: Path) -> bool:
     return False
 
 
-def _load_pair(reference: Path, test: Path, options: argparse.Namespace) -> _Pair:
-    """Read both images and bring them to one display; an array is read later, part by part."""
-    images = [_open(path, options) for path in (reference, test)]
+def _displays(options: argparse.Namespace) -> tuple[Display, Display]:
+    """Return the displays of sRGB-coded images and of light."""
+    return (
+        Display.srgb(options.peak, options.exposure),
+        Display.linear(options.white, options.exposure),
+    )
+
+
+def _load_pairs(
+    reference: Path, test: Path, displays: tuple[Display, Display], options: argparse.Namespace
+) -> tuple[list[_Pair], list[str]]:
+    """Read both images, and say what was assumed; an array is read later, part by part.
+
+    There are several pairs where the files have several views, or where their transparency differs:
+    then no single background shows all of the difference.
+    """
+    paths = reference, test
+    images = [_open(path, options) for path in paths]
     shapes = [tuple(image.pixels.shape) for image in images]
+    names = _names(paths)
     if shapes[0] != shapes[1]:
         sizes = [f"{shape[2]} x {shape[1]}" for shape in shapes]
         raise ImageError(
             f"{test}: expected the size of {reference}, {sizes[0]}, got {sizes[1]}; "
             "crop or scale one of them"
         )
-    assumptions = []
-    if any(image.linear for image in images):
-        assumptions.append(f"EXR is linear BT.709, and 1.0 is {options.white:g} cd/m2 (--white)")
-    if not all(image.linear for image in images):
-        assumptions.append(f"PNG and JPEG are sRGB, and white is {options.peak:g} cd/m2 (--peak)")
-    assumptions.append(f"exposure {options.exposure:+g} stops (--exposure)")
-    for path, image in zip((reference, test), images, strict=True):
-        assumptions += [f"{path.name}: {note}" for note in image.notes]
-    if not any(image.linear for image in images):
-        display = Display.srgb(options.peak, options.exposure)
-        return _Pair(images[0].pixels, images[1].pixels, display, assumptions)
-    scale = options.peak / options.white
-    one, other = (
-        image.pixels if image.linear else _Linear(image.pixels, scale) for image in images
+    assumptions = [*_scales(images, options)]
+    views = _views(images)
+    if len(views) > 1:
+        assumptions.append(
+            f"the views {' and '.join(views)} are compared: each pixel has the larger difference"
+        )
+    groups = [images]
+    groups += [[_open(path, options, view) for path in paths] for view in views[1:]]
+    shown: list[str | None] = [*views] or [None]
+    differ = [view for view, group in zip(shown, groups, strict=True) if _differ(group)]
+    if differ:
+        assumptions.append(f"the transparency of the two differs: {_over(options)}")
+    if differ and options.background is None:
+        groups += [[_open(path, options, view, "white") for path in paths] for view in differ]
+    for number, name in enumerate(names):
+        notes = dict.fromkeys(note for group in groups for note in group[number].notes)
+        assumptions += [f"{name}: {note}" for note in notes]
+    return [_pair(group, displays, options) for group in groups], assumptions
+
+
+def _pair(
+    images: Sequence[_Opened], displays: tuple[Display, Display], options: argparse.Namespace
+) -> _Pair:
+    """Bring two images to one display."""
+    if all(image.kind == "coded" for image in images):
+        return _Pair(images[0].pixels, images[1].pixels, displays[0])
+    one, other = (_light(image, options) for image in images)
+    return _Pair(one, other, displays[1])
+
+
+def _light(image: _Opened, options: argparse.Namespace) -> Source:
+    """Return linear values, of which 1.0 is ``--white``."""
+    if image.kind == "coded":
+        return _Linear(image.pixels, options.peak / options.white)
+    if image.kind == "absolute":
+        assert image.image is not None
+        scaled: Tensor = image.image.pixels / options.white
+        return scaled
+    return image.pixels
+
+
+def _scales(images: Sequence[_Opened], options: argparse.Namespace) -> Iterator[str]:
+    """What the values of the images are taken for."""
+    told = {
+        "scene": f"linear BT.709, and 1.0 is {options.white:g} cd/m2 (--white)",
+        "coded": f"sRGB, and white is {options.peak:g} cd/m2 (--peak)",
+        "absolute": "absolute light in cd/m2",
+    }
+    for kind, what in told.items():
+        contents = list(dict.fromkeys(image.content for image in images if image.kind == kind))
+        if contents:
+            yield f"{' and '.join(contents)} {'are' if len(contents) > 1 else 'is'} {what}"
+    yield f"exposure {options.exposure:+g} stops (--exposure)"
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """What the files are called where they must be told apart."""
+    return (
+        [str(path) for path in paths]
+        if paths[0].name == paths[1].name
+        else [path.name for path in paths]
     )
-    return _Pair(one, other, Display.linear(options.white, options.exposure), assumptions)
+
+
+def _views(images: Sequence[_Opened]) -> list[str]:
+    """The views that both files have, if they have the same ones; else none."""
+    one, other = (image.image.views if image.image else () for image in images)
+    return list(one) if set(one) == set(other) else []
+
+
+def _differ(images: Sequence[_Opened]) -> bool:
+    """Whether the transparency of two images differs."""
+    one, other = (image.image for image in images)
+    if one is None or other is None:
+        return False
+    if one.alpha is not None and other.alpha is not None:
+        return not torch.equal(one.alpha, other.alpha)
+    for image in (one, other):
+        # An EXR without alpha, as a denoiser leaves it, has the picture over black all the same.
+        if image.alpha is not None and not image.associated:
+            return bool((image.alpha < 1.0).any())
+    return False
+
+
+def _over(options: argparse.Namespace) -> str:
+    if options.background is not None:
+        return f"compared over {options.background} alone, as asked for (--background)"
+    return (
+        "compared over black and over white, and each pixel has the larger difference "
+        "(--background chooses one)"
+    )
 
 
 def _reproduce(
@@ -467,6 +678,12 @@ def _reproduce(
         words += ["--tile", str(tile)]
     if options.part is not None:
         words += ["--part", options.part]
+    if options.channels is not None:
+        words += ["--channels", ",".join(f"{key}={name}" for key, name in options.channels.items())]
+    if options.background is not None:
+        words += ["--background", options.background]
+    if options.coded:
+        words.append("--coded")
     return shlex.join(words)
 
 
@@ -506,6 +723,22 @@ def _text(
 
 def _part(text: str | None) -> int | str | None:
     return int(text) if text is not None and text.isdecimal() else text
+
+
+def _channels(text: str) -> Mapping[str, str]:
+    pairs = [part.partition("=") for part in text.split(",")]
+    named = {key.strip().upper(): name for key, _, name in pairs}
+    if not {"R", "G", "B"} <= set(named) <= {"R", "G", "B", "A"} or "" in named.values():
+        raise argparse.ArgumentTypeError(f"expected R=NAME,G=NAME,B=NAME, got {text!r}")
+    return named
+
+
+def _background(text: str) -> str:
+    try:
+        colour(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text
 
 
 def number(text: str, what: str, low: float, high: float = math.inf) -> float:
