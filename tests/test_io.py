@@ -90,7 +90,7 @@ def box(x: int, y: int, width: int, height: int) -> tuple[Any, Any]:
     return (np.array([x, y], np.int32), np.array([x + width - 1, y + height - 1], np.int32))
 
 
-def rgb(values: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+def rgb(values: NDArray[Any]) -> dict[str, NDArray[Any]]:
     return dict(zip("RGB", values, strict=True))
 
 

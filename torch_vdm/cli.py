@@ -125,17 +125,21 @@ def run(
     try:
         return command()
     except refusals as error:  # of the library, one line each
-        print(f"{program}: {error}", file=sys.stderr)
-        return BAD_INPUT
+        return _ended(program, str(error), BAD_INPUT)
     except OSError as error:
-        print(f"{program}: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
-        return BAD_INPUT
+        return _ended(program, f"{error.filename or 'output'}: {error.strerror}", BAD_INPUT)
     except KeyboardInterrupt:
-        print(f"{program}: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return _ended(program, "interrupted", INTERRUPTED)
     except Exception as error:
-        print(f"{program}: {_internal(error)}", file=sys.stderr)
-        return INTERNAL
+        return _ended(program, _internal(error), INTERNAL)
+
+
+def _ended(program: str, why: str, status: int) -> int:
+    """Return the status, after one line on standard error if anybody reads that."""
+    if sys.stderr is not None:
+        with contextlib.suppress(OSError):
+            print(f"{program}: {why}", file=sys.stderr)
+    return status
 
 
 def _internal(error: Exception) -> str:

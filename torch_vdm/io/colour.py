@@ -68,16 +68,22 @@ def shown(codes: Floats, colour: Colour, bits: int, notes: list[str]) -> tuple[F
     return _by_gamma(codes, colour.gamma, colour.chromaticities or BT709, notes), "coded"
 
 
-def _by_cicp(
-    codes: Floats, cicp: tuple[int, int, int, int], bits: int, notes: list[str]
-) -> tuple[Floats, Kind]:
-    space, transfer, matrix, full = cicp
+def check_cicp(cicp: tuple[int, int, int, int]) -> None:
+    """Refuse colours that are not known."""
+    space, transfer, matrix, _ = cicp
     known = (*VIDEO, GAMMA22, GAMMA28, LINEAR, SRGB, PQ, HLG)
     if space not in PRIMARIES or transfer not in known or matrix != 0:
         raise ImageError(
             f"expected colours of BT.709, BT.2020 or P3 as sRGB, linear, PQ, HLG or video, got "
             f"cICP {space}/{transfer}/{matrix}; convert the image to sRGB first"
         )
+
+
+def _by_cicp(
+    codes: Floats, cicp: tuple[int, int, int, int], bits: int, notes: list[str]
+) -> tuple[Floats, Kind]:
+    check_cicp(cicp)
+    space, transfer, matrix, full = cicp
     if cicp == (1, SRGB, 0, 1):
         return codes, "coded"
     values = codes.astype(np.float64)

@@ -29,7 +29,7 @@ def load_pnm(data: bytes, notes: list[str]) -> Decoded:
         raise ImageError(f"damaged PNM: its white is {white}; export it again")
     samples = 3 if found[1] == b"6" else 1
     stored = np.dtype(">u2" if white > 255 else "u1")
-    values = _pixels(data, found.end(), (height, width, samples), stored, "PNM").astype(np.uint32)
+    values = _pixels(data, found.end(), (height, width, samples), stored).astype(np.uint32)
     bits = 16 if white > 255 else 8
     full = 2**bits - 1
     scaled = (np.minimum(values, white) * full + white // 2) // white
@@ -46,7 +46,7 @@ def load_pfm(data: bytes, repair: Repair, notes: list[str]) -> Decoded:
     kind, width, height, scale = found[1], int(found[2]), int(found[3]), _scale(found[4])
     stored = np.dtype("<f4" if scale < 0 else ">f4")
     samples = 3 if kind == b"F" else 1
-    values = _pixels(data, found.end(), (height, width, samples), stored, "PFM")
+    values = _pixels(data, found.end(), (height, width, samples), stored)
     planes = np.moveaxis(values[::-1], -1, 0).astype(np.float32)
     if abs(scale) != 1:
         notes.append(f"Values are multiplied by the scale that the file states, {abs(scale):g}.")
@@ -71,11 +71,9 @@ def _scale(text: bytes) -> float:
 
 
 def _pixels(
-    data: bytes, at: int, shape: tuple[int, int, int], stored: np.dtype[Any], name: str
+    data: bytes, at: int, shape: tuple[int, int, int], stored: np.dtype[Any]
 ) -> NDArray[Any]:
     height, width, samples = shape
-    if not (height and width):
-        raise ImageError(f"damaged {name}: {width} x {height} pixels; export it again")
     size = height * width * samples * stored.itemsize
     check_size(width, height, size, len(data))
     if at + size > len(data):

@@ -60,7 +60,7 @@ def load_picture(data: bytes, content: str, notes: list[str]) -> Decoded:
         raise ImageError(f"damaged {content} ({error}); export it again") from error
     colour = Colour(profile=profile if isinstance(profile, bytes) and profile else None)
     if content == "TIFF" and turn != 1:
-        notes.append(f"The image is turned as its orientation {turn} says.")
+        notes.append(f"The image is turned as its EXIF orientation {turn} says.")
         turn = 1
     return decoded(values, colour, turn, notes)
 
@@ -73,7 +73,7 @@ def decoded(
     associated: bool = False,
 ) -> Decoded:
     """Return whole numbers (H, W, 1 to 4), grey or colour and perhaps alpha, as an image."""
-    values = turned(values, turn)
+    values = turned(values, turn, notes)
     bits = 8 * values.dtype.itemsize
     planes = np.moveaxis(values, -1, 0).astype(np.float32) / np.float32(2**bits - 1)
     clear = alpha.plane(planes[-1], notes) if len(planes) in (2, 4) else None
@@ -81,8 +81,6 @@ def decoded(
     if len(colours) == 1:
         notes.append("The image is grey: R = G = B.")
         colours = np.broadcast_to(colours, (3, *colours.shape[1:]))
-    if turn != 1:
-        notes.append(f"The image is turned as its EXIF orientation {turn} says.")
     if clear is not None and associated and colour != Colour():
         colours, associated = alpha.straight(colours, clear), False
     pixels, kind = shown(colours, colour, bits, notes)
@@ -103,8 +101,10 @@ def orientation(image: "Image", raw: bytes | None = None) -> int:
     return turn if isinstance(turn, int) and 1 <= turn <= 8 else 1
 
 
-def turned(values: NDArray[Any], turn: int) -> NDArray[Any]:
-    """Return (H, W, C) as its EXIF orientation says."""
+def turned(values: NDArray[Any], turn: int, notes: list[str]) -> NDArray[Any]:
+    """Return (H, W, C) as its EXIF orientation, which is TIFF's, says."""
+    if turn != 1:
+        notes.append(f"The image is turned as its EXIF orientation {turn} says.")
     # EXIF 2.3, 4.6.4 A: where row 0 and column 0 of the stored image are in the upright one.
     if turn >= 5:
         values = values.swapaxes(0, 1)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_vdm.io.colour import Colour
+from torch_vdm.io.colour import Colour, check_cicp
 from torch_vdm.io.decoded import Decoded
 from torch_vdm.io.pictures import decoded, orientation
 from torch_vdm.io.refusal import ImageError, check_size
@@ -94,12 +94,15 @@ def _grey_with_alpha(data: bytes) -> NDArray[np.uint16]:
 
 def _colour(data: bytes, image: "PngImageFile") -> Colour:
     """What the file says of its colours."""
-    cicp = next((body for name, body in _chunks(data) if name == b"cICP"), None)
+    stored = next((body for name, body in _chunks(data) if name == b"cICP"), None)
+    cicp = None if stored is None else struct.unpack(">4B", stored)
+    if cicp is not None:
+        check_cicp(cicp)
     profile = image.info.get("icc_profile")
     gamma = image.info.get("gamma")
     stated = image.info.get("chromaticity")  # white first
     return Colour(
-        None if cicp is None else struct.unpack(">4B", cicp),
+        cicp,
         profile if isinstance(profile, bytes) else None,
         "srgb" in image.info,
         float(gamma) if isinstance(gamma, float) else None,

@@ -43,6 +43,8 @@ def printable(text: str) -> str:
 
 def check_size(width: int, height: int, decoded: int, size: int) -> None:
     """Refuse what would exhaust memory, and what the file is too small to hold."""
+    if width < 1 or height < 1:
+        raise ImageError(f"damaged: {width} x {height} pixels; export it again")
     if width > MAX_SIDE or height > MAX_SIDE or width * height > MAX_PIXELS:
         raise ImageError(
             f"expected at most {MAX_PIXELS} pixels and {MAX_SIDE} a side, got {width} x {height}; "

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 PROFILE, TRANSFER_FUNCTION, CHROMATICITIES = 34675, 301, 319
 UNCOMPRESSED, GREY_WHITE_IS_0, GREY, RGB = 1, 0, 1, 2
 UNSIGNED, FLOAT = 1, 3
+DEFLATE = 8, 32946
 ASSOCIATED, UNASSOCIATED = 1, 2
 
 
@@ -45,8 +46,8 @@ def load_tiff(data: bytes, repair: Repair, coded: bool, notes: list[str]) -> Dec
             samples = page.samplesperpixel
             size = page.imagewidth * page.imagelength * samples * page.bitspersample // 8
             check_size(page.imagewidth, page.imagelength, size, len(data))
-            if page.bitspersample <= 8 and ASSOCIATED not in page.extrasamples:
-                return load_picture(data, "TIFF", notes)  # palettes, bits, inks, all compressions
+            if _is_for_pillow(page):
+                return load_picture(data, "TIFF", notes)
             _check(page)
             values = _values(page)
             profile = _tag(page, PROFILE)
@@ -65,7 +66,7 @@ def load_tiff(data: bytes, repair: Repair, coded: bool, notes: list[str]) -> Dec
     turn = turn if isinstance(turn, int) and 1 <= turn <= 8 else 1
     profile = profile if isinstance(profile, bytes) else None
     if values.dtype.kind == "f":
-        return _floats(turned(values, turn), profile, associated, repair, coded, notes)
+        return _floats(turned(values, turn, notes), profile, associated, repair, coded, notes)
     if values.dtype.itemsize == 2:
         notes.append("The channels have 16 bits.")
     return decoded(values, Colour(profile=profile), turn, notes, associated)
@@ -79,6 +80,14 @@ def _only_page(pages: list["TiffPage"]) -> "TiffPage":
             f"expected one picture, got {len(whole)} in a file; write each to a file of its own"
         )
     return whole[0]
+
+
+def _is_for_pillow(page: "TiffPage") -> bool:
+    """Whether it has what tifffile alone knows nothing of: palettes, bits, most compressions."""
+    if page.bitspersample > 8 or ASSOCIATED in page.extrasamples:
+        return False
+    plain = page.bitspersample == 8 and page.photometric in (GREY_WHITE_IS_0, GREY, RGB)
+    return not plain or page.compression not in (UNCOMPRESSED, *DEFLATE)
 
 
 def _check(page: "TiffPage") -> None:
@@ -101,7 +110,7 @@ def _values(page: "TiffPage") -> NDArray[Any]:
     """(H, W, 1 to 4): grey or colour, and alpha where there is any."""
     try:
         stored = page.asarray()
-    except (ValueError, NotImplementedError) as error:
+    except (ValueError, KeyError, NotImplementedError) as error:
         if "imagecodecs" not in str(error):
             raise
         raise ImageError(
