@@ -192,6 +192,8 @@ def _decoded(data: bytes) -> dict[str, Floats]:
 
     try:
         parts = OpenEXR.File(io.BytesIO(data), separate_channels=True).parts
+    except MemoryError:
+        raise
     except Exception as error:
         raise damaged(f"the OpenEXR library refuses it ({error})") from error
     if not parts:  # it prints a warning and leaves out a part that it cannot read

@@ -22,7 +22,7 @@ from torch_vdm.io.alpha import colour, over
 from torch_vdm.io.decoded import Decoded, Kind
 from torch_vdm.io.exr import Choice, encode_exr, load_exr
 from torch_vdm.io.netpbm import load_pfm, load_pnm
-from torch_vdm.io.pictures import READERS, encode_coded, load_picture
+from torch_vdm.io.pictures import encode_coded, load_picture
 from torch_vdm.io.png import load_png
 from torch_vdm.io.radiance import load_hdr
 from torch_vdm.io.refusal import Floats, ImageError, Negative, Nonfinite, Repair, printable
@@ -205,7 +205,7 @@ def load(
         they are, light as light; colours that are associated with alpha (OpenEXR, some TIFF) are
         not multiplied by it again.
     coded
-        Take floating-point values (OpenEXR, PFM, TIFF) for sRGB-coded ones.
+        Take values of light (OpenEXR, .hdr, PFM, TIFF of floating point) for sRGB-coded ones.
     quiet
         Keep the libraries from printing. The OpenEXR library writes to standard output and standard
         error by itself when the data inside a block is damaged. To hold that back, file descriptors
@@ -392,7 +392,10 @@ class _Slices:
     def __getitem__(self, part: slice, /) -> bytes:
         begin, end, _ = part.indices(self._size)
         self._file.seek(begin)
-        return self._file.read(max(0, end - begin))
+        data = self._file.read(max(0, end - begin))
+        if len(data) < end - begin:
+            raise ImageError("incomplete: the file became shorter while it was read; wait for it")
+        return data
 
 
 def _decoded(
@@ -432,8 +435,13 @@ def _decoded_whole(
         image = load_pfm(data, repair, notes)
         return image._replace(kind="coded") if coded else image
     if content == "HDR":
-        return load_hdr(data, repair.nonfinite, notes)
-    assert content in READERS
+        image = load_hdr(data, repair.nonfinite, notes)
+        return image._replace(kind="coded") if coded else image
+    if content == "JPEG XL":
+        # The libraries for Python tell neither how many pictures there are nor their colours.
+        raise ImageError(
+            "expected another format, got JPEG XL; convert it to PNG with libjxl's djxl"
+        )
     return load_picture(data, content, notes)
 
 

@@ -1,4 +1,4 @@
-"""Pictures of whole numbers that Pillow reads: JPEG, WebP, GIF, BMP, TGA, AVIF, JPEG XL.
+"""Pictures of whole numbers that Pillow reads: JPEG, WebP, GIF, BMP, TGA, AVIF.
 
 Pillow is imported where it is used: importing the package stays fast.
 """
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch_vdm.io import alpha
 from torch_vdm.io.colour import SRGB, VIDEO, Colour, shown
 from torch_vdm.io.decoded import Decoded
+from torch_vdm.io.primaries import Chromaticities
 from torch_vdm.io.refusal import Floats, ImageError, check_size, first_pixel
 
 if TYPE_CHECKING:
@@ -22,8 +23,7 @@ if TYPE_CHECKING:
 
 ORIENTATION = 0x0112  # the tag of EXIF and of TIFF
 
-# Where Pillow, or a package beside it, reads a format: module, class, and what to install where
-# the module is missing or cannot do it.
+# Where Pillow reads a format: module, class, and what to install where the module is missing.
 READERS = {
     "JPEG": ("PIL.JpegImagePlugin", "jpeg_factory", "Pillow"),
     "WebP": ("PIL.WebPImagePlugin", "WebPImageFile", "Pillow with WebP"),
@@ -33,15 +33,19 @@ READERS = {
     "TIFF": ("PIL.TiffImagePlugin", "TiffImageFile", "Pillow"),
     "PNM": ("PIL.PpmImagePlugin", "PpmImageFile", "Pillow"),
     "AVIF": ("PIL.AvifImagePlugin", "AvifImageFile", "Pillow 11.3 or newer"),
-    "JPEG XL": ("pillow_jxl.JpegXLImagePlugin", "JXLImageFile", "pillow-jxl-plugin"),
 }
 
 # What Pillow calls pixels of 8 bits that have colours to be shown.
 MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX")
 
 
-def load_picture(data: bytes, content: str, notes: list[str]) -> Decoded:
-    """Return the image of a file; what was assumed goes to ``notes``."""
+def load_picture(
+    data: bytes, content: str, notes: list[str], chromaticities: Chromaticities | None = None
+) -> Decoded:
+    """Return the image of a file; what was assumed goes to ``notes``.
+
+    ``chromaticities`` are those that the file states, where Pillow does not tell.
+    """
     try:
         with _opened(data, content) as image:
             check_size(*image.size, 4 * image.size[0] * image.size[1], len(data))
@@ -51,14 +55,13 @@ def load_picture(data: bytes, content: str, notes: list[str]) -> Decoded:
             image.load()
             values = _values(image, content == "TGA" and not _tga_has_alpha(data))
             profile = image.info.get("icc_profile")
-    except ImageError:
-        raise
-    except MemoryError:
+    except (ImageError, MemoryError):
         raise
     except Exception as error:
         # The decoders raise about every class there is when a file is damaged.
         raise ImageError(f"damaged {content} ({error}); export it again") from error
-    colour = Colour(profile=profile if isinstance(profile, bytes) and profile else None)
+    profile = profile if isinstance(profile, bytes) and profile else None
+    colour = Colour(profile=profile, chromaticities=chromaticities)
     if content == "TIFF" and turn != 1:
         notes.append(f"The image is turned as its EXIF orientation {turn} says.")
         turn = 1

@@ -42,7 +42,7 @@ def load_png(data: bytes, notes: list[str]) -> Decoded:
             colour = _colour(data, image)
             turn = orientation(image, _raw_exif(image))
             values = _values(data, image, depth, kind)
-    except ImageError:
+    except (ImageError, MemoryError):
         raise
     except Exception as error:
         # The decoders raise about every class there is when a file is damaged.

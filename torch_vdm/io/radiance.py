@@ -126,13 +126,19 @@ def _colours(image: Floats, variables: list[tuple[str, str]], notes: list[str]) 
         raise ImageError(
             f"expected the format 32-bit_rle_rgbe or 32-bit_rle_xyze, got {named['FORMAT'][:40]!r}"
         )
-    exposure = np.prod([_numbers(value, 1)[0] for name, value in variables if name == "EXPOSURE"])
-    if exposure != 1:
-        if not 1e-20 < exposure < 1e20:
-            raise ImageError(f"damaged Radiance file: an exposure of {exposure:g}; export it again")
-        notes.append(f"Values are divided by the exposure that the file states, {exposure:g}.")
+    exposure = np.ones(3)
+    for name, value in variables:
+        if name == "EXPOSURE":
+            exposure *= _numbers(value, 1)
+        elif name == "COLORCORR":
+            exposure *= _numbers(value, 3)
+    if (exposure != 1).any():
+        told = ", ".join(f"{factor:g}" for factor in dict.fromkeys(exposure))
+        if not ((exposure > 1e-20) & (exposure < 1e20)).all():
+            raise ImageError(f"damaged Radiance file: an exposure of {told}; export it again")
+        notes.append(f"Values are divided by the exposure that the file states, {told}.")
         with np.errstate(over="ignore"):
-            image = image / np.float32(exposure)
+            image = image / exposure.astype(np.float32)[:, None, None]
     if known[named.get("FORMAT", "32-bit_rle_rgbe")]:
         notes.append("Colours are converted from CIE XYZ to BT.709.")
         return converted(image, to_bt709(rgb_to_xyz(XYZ), BT709[6:]))

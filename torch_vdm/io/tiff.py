@@ -13,6 +13,7 @@ from torch_vdm.io import alpha, icc
 from torch_vdm.io.colour import Colour
 from torch_vdm.io.decoded import Decoded
 from torch_vdm.io.pictures import ORIENTATION, decoded, load_picture, turned
+from torch_vdm.io.primaries import BT709, Chromaticities, converted, rgb_to_xyz, to_bt709
 from torch_vdm.io.refusal import (
     Floats,
     ImageError,
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from tifffile import TiffPage
 
 # TIFF 6.0: tags, and what their values mean.
-PROFILE, TRANSFER_FUNCTION, CHROMATICITIES = 34675, 301, 319
+PROFILE, TRANSFER_FUNCTION, WHITE, CHROMATICITIES = 34675, 301, 318, 319
 UNCOMPRESSED, GREY_WHITE_IS_0, GREY, RGB = 1, 0, 1, 2
 UNSIGNED, FLOAT = 1, 3
 DEFLATE = 8, 32946
@@ -46,30 +47,28 @@ def load_tiff(data: bytes, repair: Repair, coded: bool, notes: list[str]) -> Dec
             samples = page.samplesperpixel
             size = page.imagewidth * page.imagelength * samples * page.bitspersample // 8
             check_size(page.imagewidth, page.imagelength, size, len(data))
+            chromaticities = _chromaticities(page)
             if _is_for_pillow(page):
-                return load_picture(data, "TIFF", notes)
+                return load_picture(data, "TIFF", notes, chromaticities)
             _check(page)
             values = _values(page)
             profile = _tag(page, PROFILE)
             turn = _tag(page, ORIENTATION)
             associated = ASSOCIATED in page.extrasamples
-            told = CHROMATICITIES in page.tags or TRANSFER_FUNCTION in page.tags
-    except ImageError:
-        raise
-    except MemoryError:
+    except (ImageError, MemoryError):
         raise
     except Exception as error:
         # The decoder raises about every class there is when a file is damaged.
         raise ImageError(f"damaged TIFF ({error}); export it again") from error
-    if told and profile is None:
-        raise ImageError("expected an ICC profile for other colours than sRGB, got TIFF's own tags")
     turn = turn if isinstance(turn, int) and 1 <= turn <= 8 else 1
     profile = profile if isinstance(profile, bytes) else None
     if values.dtype.kind == "f":
-        return _floats(turned(values, turn, notes), profile, associated, repair, coded, notes)
+        colour = Colour(profile=profile, chromaticities=chromaticities)
+        return _floats(turned(values, turn, notes), colour, associated, repair, coded, notes)
     if values.dtype.itemsize == 2:
         notes.append("The channels have 16 bits.")
-    return decoded(values, Colour(profile=profile), turn, notes, associated)
+    colour = Colour(profile=profile, chromaticities=chromaticities)
+    return decoded(values, colour, turn, notes, associated)
 
 
 def _only_page(pages: list["TiffPage"]) -> "TiffPage":
@@ -132,7 +131,7 @@ def _values(page: "TiffPage") -> NDArray[Any]:
 
 def _floats(
     values: NDArray[Any],
-    profile: bytes | None,
+    colour: Colour,
     associated: bool,
     repair: Repair,
     coded: bool,
@@ -152,18 +151,40 @@ def _floats(
     if len(planes) == 1:
         notes.append("The image is grey: R = G = B.")
         planes = np.broadcast_to(planes, (3, *planes.shape[1:]))
-    if profile is None:
+    if colour == Colour():
         return Decoded(planes, "coded" if coded else "scene", clear, associated)
     if coded:
-        raise ImageError("expected no ICC profile with --coded, got one; leave out --coded")
-    colours = icc.read_profile(profile)
-    if not colours.is_linear:
+        raise ImageError("expected sRGB with --coded, got a TIFF of other colours; leave it out")
+    notes.append("Colours are converted to BT.709 as the file says.")
+    return Decoded(_linear_bt709(planes, colour), "scene", clear, associated)
+
+
+def _linear_bt709(planes: Floats, colour: Colour) -> Floats:
+    if colour.profile is None:
+        assert colour.chromaticities is not None
+        matrix = to_bt709(rgb_to_xyz(colour.chromaticities), colour.chromaticities[6:])
+        return converted(planes, matrix)
+    profile = icc.read_profile(colour.profile)
+    if not profile.is_linear:
         raise ImageError(
             "expected a linear ICC profile for floating-point values, got another; save linear "
             "values, or remove the profile and pass --coded if they are sRGB-coded"
         )
-    notes.append("Colours are converted to BT.709 as its ICC profile says.")
-    return Decoded(colours.light(planes), "scene", clear, associated)
+    return profile.light(planes)
+
+
+def _chromaticities(page: "TiffPage") -> Chromaticities | None:
+    """x, y of red, green, blue and white, which the file states as fractions."""
+    if TRANSFER_FUNCTION in page.tags and PROFILE not in page.tags:
+        raise ImageError("expected a curve as an ICC profile, got a TIFF's own; save it as PNG")
+    stated = [_tag(page, CHROMATICITIES), _tag(page, WHITE)]
+    if not isinstance(stated[0], tuple) or len(stated[0]) != 12:
+        return None
+    white = stated[1] if isinstance(stated[1], tuple) and len(stated[1]) == 4 else None
+    numbers = np.array([*stated[0], *(white or ())], np.float64).reshape(-1, 2)
+    with np.errstate(all="ignore"):
+        fractions = numbers[:, 0] / numbers[:, 1]
+    return (*map(float, fractions), *(() if white else BT709[6:]))
 
 
 def _tag(page: "TiffPage", number: int) -> object:
