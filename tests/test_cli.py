@@ -584,6 +584,7 @@ def test_closed_streams_end_quietly(
         (RuntimeError("shape"), 3, "internal error, RuntimeError: shape"),
         (MemoryError(), 3, "not enough memory; make the images smaller, or compare in tiles"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: you"), 3, "not enough memory; "),
+        (OSError(12, "Cannot allocate memory"), 3, "not enough memory; make the images smaller"),
         (OSError(28, "No space left on device"), 2, "output: No space left on device"),
     ],
 )

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import ImageCms
 
-from tests.test_io import png16, refusal
+from tests.test_io import XYZ_TO_BT709, png16, refusal
 from torch_vdm.io import ImageError, load, read_image
 
 # Linear RGB to linear BT.709. ITU-R BT.2087-0, and the P3 matrix of the CSS Color module, level 4
@@ -376,7 +376,27 @@ def test_gamma_and_primaries(tmp_path: Path, gamma: float | None, space: str | N
     light = srgb_light(values) if gamma is None else values ** (1 / gamma)
     expected = srgb_code(np.tensordot(BY_NAME[space or "BT.709"], light, 1))
     np.testing.assert_allclose(image.pixels, expected, atol=2e-3)
-    assert "what the file states (gAMA, cHRM)" in image.notes[-1]
+    assert "converted to sRGB from the primaries that it states" in image.notes[-1]
+
+
+def test_adobe_rgb_of_cameras(tmp_path: Path) -> None:
+    exif = PIL.Image.Exif()
+    exif.get_ifd(0x8769)[0xA001] = 0xFFFF
+    exif.get_ifd(0x8769)[0xA005] = {1: "R03"}
+    path = tmp_path / "image.jpg"
+    PIL.Image.new("RGB", (16, 16), (60, 200, 100)).save(path, exif=exif, quality=100)
+    image = load(path)
+    with PIL.Image.open(path) as picture:
+        stored = planes(np.asarray(picture), 8)
+    # Adobe RGB (1998), 4.3.6: to XYZ of D65; and IEC 61966-2-1 from there.
+    to_xyz = [(0.57667, 0.18556, 0.18823), (0.29734, 0.62736, 0.07529), (0.02703, 0.07069, 0.99134)]
+    light = np.tensordot(XYZ_TO_BT709 @ to_xyz, stored ** (563 / 256), 1)
+    np.testing.assert_allclose(image.pixels, srgb_code(light), atol=3e-3)
+    assert image.pixels.min() < 0
+    PIL.Image.new("RGB", (16, 16), (60, 200, 100)).save(
+        path, exif=exif, icc_profile=profile(SRGB_CURVE)
+    )
+    assert load(path).pixels.min() > 0
 
 
 def test_what_wins(tmp_path: Path) -> None:

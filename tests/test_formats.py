@@ -27,7 +27,7 @@ from tests.test_colour import (
     srgb_light,
     with_chunks,
 )
-from tests.test_io import XYZ_TO_BT709, fuzz, png16, refusal
+from tests.test_io import XYZ_TO_BT709, fuzz, hand_made_exr, png16, refusal, rgb, write_exr
 from torch_vdm.io import ImageError, load, read_image
 
 Bytes = NDArray[np.uint8]
@@ -381,6 +381,20 @@ def test_tiff_states_its_primaries(tmp_path: Path, dtype: str, name: str) -> Non
     np.testing.assert_allclose(load(path).pixels, expected, atol=2e-3)
 
 
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+@pytest.mark.parametrize("first", [False, True])
+def test_a_tiff_with_a_thumbnail_is_one_picture(tmp_path: Path, dtype: str, first: bool) -> None:
+    values = np.random.default_rng(1).integers(0, 200, (8, 6, 3)).astype(dtype)
+    path = tmp_path / "image.tiff"
+    with tifffile.TiffWriter(path) as writer:
+        if first:
+            writer.write(values[::2, ::2], photometric="rgb", subfiletype=1)
+        writer.write(values, photometric="rgb")
+        if not first:
+            writer.write(values[::2, ::2], photometric="rgb", subfiletype=1)
+    np.testing.assert_array_equal(load(path).pixels, unit(values))
+
+
 def test_tiff_that_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "image.tiff"
     image = np.zeros((4, 5, 3), np.uint8)
@@ -582,6 +596,30 @@ def test_files_are_not_read_whole_before_their_head(tmp_path: Path) -> None:
                 pytest.skip("the file system has no sparse files")
         words = "it begins with bytes" if name == "a.exr" else "expected a file of at most"
         assert words in refusal(path)
+
+
+def test_of_a_large_openexr_file_only_the_wanted_part_is_read(tmp_path: Path) -> None:
+    values = np.random.default_rng(1).uniform(0, 1, (3, 8, 9)).astype(np.float32)
+    path = write_exr(tmp_path / "image.exr", rgb(values))
+    with path.open("r+b") as file:
+        try:
+            file.truncate(200 * 2**30)
+        except OSError:
+            pytest.skip("the file system has no sparse files")
+    np.testing.assert_array_equal(load(path).pixels, values)
+
+
+def test_a_block_that_is_larger_than_its_pixels_is_not_read(tmp_path: Path) -> None:
+    plane = np.ones((4, 6), np.float32)
+    path = hand_made_exr(tmp_path / "image.exr", dict.fromkeys("RGB", (plane, 1)))
+    row = struct.pack("<ii", 0, 72)  # the first row, and the size of its block
+    path.write_bytes(path.read_bytes().replace(row, struct.pack("<ii", 0, 2**31 - 1), 1))
+    with path.open("r+b") as file:
+        try:
+            file.truncate(4 * 2**30)
+        except OSError:
+            pytest.skip("the file system has no sparse files")
+    assert "a block of pixels has 2147483647 bytes" in refusal(path)
 
 
 def test_damaged_files_of_other_formats_do_no_harm(tmp_path: Path) -> None:

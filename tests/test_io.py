@@ -400,6 +400,54 @@ def test_nonfinite_values(tmp_path: Path) -> None:
     )
 
 
+def clamped(values: NDArray[Any], largest: float) -> NDArray[np.float32]:
+    """Return a plane with infinity held and NaN filled, one value after another."""
+    out = values.astype(np.float32)
+    for y, x in np.ndindex(values.shape):
+        if np.isnan(values[y, x]):
+            near = values[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2].astype(np.float64)
+            near = near[np.isfinite(near)]
+            out[y, x] = near.mean() if near.size else 0
+        elif np.isinf(values[y, x]):
+            out[y, x] = np.sign(values[y, x]) * largest
+    return out
+
+
+@given(
+    half=st.booleans(),
+    bad=st.lists(
+        st.tuples(
+            st.integers(0, 2),
+            st.integers(0, 4),
+            st.integers(0, 5),
+            st.sampled_from([np.nan, np.inf, -np.inf]),
+        ),
+        min_size=1,
+        max_size=60,
+    ),
+)
+def test_infinity_is_held_and_nan_filled(
+    half: bool,
+    bad: list[tuple[int, int, int, float]],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    values = planes(3, 5, 6).astype(np.float16 if half else np.float32)
+    for channel, y, x, value in bad:
+        values[channel, y, x] = value
+    path = write_exr(tmp_path_factory.getbasetemp() / "clamp.exr", rgb(values))
+    image = load(path, nonfinite="clamp", negative="keep")
+    largest = 65504 if half else float(np.finfo(np.float32).max)
+    expected = [clamped(plane, largest) for plane in values]
+    np.testing.assert_allclose(image.pixels, expected, rtol=1e-6)
+    assert image.notes[0].startswith(f"Infinity was held to {largest:g} and NaN to its neighbours'")
+
+
+def test_an_overflow_of_conversion_is_held_too(tmp_path: Path) -> None:
+    values = np.full((3, 4, 4), np.inf, np.float32)
+    path = write_exr(tmp_path / "image.exr", rgb(values), chromaticities=XYZ)
+    assert load(path, nonfinite="clamp").pixels.isfinite().all()
+
+
 def test_nonfinite_values_that_are_not_shown_do_not_matter(tmp_path: Path) -> None:
     values = planes()
     values[:, 0, 0] = np.nan
@@ -440,6 +488,18 @@ def test_negative_values(tmp_path: Path) -> None:
     image = load(path, negative="clip")
     np.testing.assert_array_equal(image.pixels, values.clip(0))
     assert "2 negative values" in image.notes[0]
+
+
+def test_negatives_that_conversion_makes_are_colours(tmp_path: Path) -> None:
+    values = planes()
+    values[:, 3, 4] = 0, 1, 0  # green of ACES, which BT.709 lacks
+    path = write_exr(tmp_path / "image.exr", rgb(values), chromaticities=ACES)
+    for negative in ("raise", "clip", "keep"):
+        image = load(path, negative=negative)
+        np.testing.assert_allclose(image.pixels[:, 3, 4], ACES_TO_BT709[:, 1], atol=1e-3)
+    values[0, 7, 3] = -0.25  # the file's own is refused, before it is converted
+    path = write_exr(tmp_path / "image.exr", rgb(values), chromaticities=ACES)
+    assert "got 1 negative value (the first at x=3, y=7; the lowest is -0.25)" in refusal(path)
 
 
 @pytest.mark.parametrize("options", [{"nonfinite": "mask"}, {"negative": "zero"}])

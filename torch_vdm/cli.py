@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import errno
 import io
 import math
 import os
@@ -112,6 +113,8 @@ def run(
     except refusals as error:  # of the library, one line each
         return _ended(program, str(error), BAD_INPUT)
     except OSError as error:
+        if error.errno == errno.ENOMEM:
+            return _ended(program, _internal(MemoryError()), INTERNAL)
         return _ended(program, f"{error.filename or 'output'}: {error.strerror}", BAD_INPUT)
     except KeyboardInterrupt:
         return _ended(program, "interrupted", INTERRUPTED)

@@ -151,7 +151,7 @@ def _by_gamma(
         raise ImageError(f"damaged: it states a gamma of {gamma:g}; export it again")
     light = decode_srgb(codes) if gamma is None else decode_gamma(codes, 1 / gamma)
     told = "sRGB's curve" if gamma is None else f"a gamma of {gamma:g}"
-    notes.append(f"Colours are converted to sRGB from what the file states (gAMA, cHRM): {told}.")
+    notes.append(f"Colours are converted to sRGB from the primaries that it states, with {told}.")
     return encode_srgb(_to_bt709(light, chromaticities)).astype(np.float32)
 
 

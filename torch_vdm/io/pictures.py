@@ -21,7 +21,12 @@ if TYPE_CHECKING:
     from PIL.Image import Image
     from PIL.ImageFile import ImageFile
 
-ORIENTATION = 0x0112  # the tag of EXIF and of TIFF
+# Tags of EXIF, the first one TIFF's too. EXIF 2.3, 4.6; DCF 2.0, 3.
+ORIENTATION, EXIF, INTEROP, COLOUR_SPACE, UNCALIBRATED = 0x0112, 0x8769, 0xA005, 0xA001, 0xFFFF
+
+# Adobe RGB (1998), 4.3.1: primaries, white, and the exponent by which light becomes code.
+ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
+ADOBE_GAMMA = 256 / 563
 
 # Where Pillow reads a format: module, class, and what to install where the module is missing.
 READERS = {
@@ -49,7 +54,8 @@ def load_picture(
     try:
         with _opened(data, content) as image:
             check_size(*image.size, 4 * image.size[0] * image.size[1], len(data))
-            _require_one_picture(image, notes)
+            if content != "TIFF":  # whose reader has counted the pages
+                _require_one_picture(image, notes)
             _require_shown(image, data, content, notes)
             turn = orientation(image)  # a TIFF's is gone once it is loaded, and the image turned
             image.load()
@@ -62,6 +68,8 @@ def load_picture(
         raise ImageError(f"damaged {content} ({error}); export it again") from error
     profile = profile if isinstance(profile, bytes) and profile else None
     colour = Colour(profile=profile, chromaticities=chromaticities)
+    if content == "JPEG" and profile is None and _is_adobe_rgb(image):
+        colour = Colour(gamma=ADOBE_GAMMA, chromaticities=ADOBE_RGB)
     if content == "TIFF" and turn != 1:
         notes.append(f"The image is turned as its EXIF orientation {turn} says.")
         turn = 1
@@ -102,6 +110,18 @@ def orientation(image: "Image", raw: bytes | None = None) -> int:
     except Exception:  # EXIF data is an afterthought: damaged, it does not make the pixels unusable
         return 1
     return turn if isinstance(turn, int) and 1 <= turn <= 8 else 1
+
+
+def _is_adobe_rgb(image: "Image") -> bool:
+    """Whether EXIF names DCF's optional colour space, as cameras that add no profile do."""
+    try:
+        details = image.getexif().get_ifd(EXIF)
+        return (
+            details.get(COLOUR_SPACE) == UNCALIBRATED
+            and image.getexif().get_ifd(INTEROP)[1] == "R03"
+        )
+    except Exception:  # as above
+        return False
 
 
 def turned(values: NDArray[Any], turn: int, notes: list[str]) -> NDArray[Any]:

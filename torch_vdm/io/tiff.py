@@ -78,6 +78,8 @@ def _only_page(pages: list["TiffPage"]) -> "TiffPage":
         raise ImageError(
             f"expected one picture, got {len(whole)} in a file; write each to a file of its own"
         )
+    if _is_for_pillow(whole[0]) and whole[0] is not pages[0]:
+        raise ImageError("expected the picture before its thumbnails; save it again without them")
     return whole[0]
 
 
