@@ -1,5 +1,7 @@
 """Transparency, straight and associated, over backgrounds: against the formula, pixel by pixel."""
 
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tests.test_colour import PRIMARIES, SRGB_CURVE, TO_BT709, profile, srgb_code, srgb_light
+from tests.test_colour import (
+    PRIMARIES,
+    SRGB_CURVE,
+    TO_BT709,
+    chunk,
+    profile,
+    srgb_code,
+    srgb_light,
+    with_chunks,
+)
 from tests.test_io import planes, png16, rgb, write_exr
 from torch_vdm.io import load, read_image
 
@@ -70,10 +81,6 @@ def test_straight_alpha_is_composited_in_coded_values(
 
 @pytest.mark.parametrize("kind", [0, 2])
 def test_a_colour_of_16_bits_may_be_clear(tmp_path: Path, kind: int) -> None:
-    import struct
-
-    from tests.test_colour import chunk, with_chunks
-
     values = np.random.default_rng(1).integers(0, 3, (6, 7, 3 if kind else 1), np.uint16) * 30000
     key = values[2, 3]
     data = png16(values, kind, interlaced=False)
@@ -84,6 +91,25 @@ def test_a_colour_of_16_bits_may_be_clear(tmp_path: Path, kind: int) -> None:
     assert image.alpha is not None
     np.testing.assert_array_equal(image.alpha, ~clear)
     assert (image.pixels[:, clear] == 0).all()
+
+
+@pytest.mark.parametrize("depth", [1, 2, 4, 8])
+@pytest.mark.parametrize("key", [0, 1])
+def test_a_grey_of_few_bits_may_be_clear(tmp_path: Path, depth: int, key: int) -> None:
+    values = np.arange(8) % 2**depth
+    bits = "".join(format(value, f"0{depth}b") for value in values)
+    row = int(bits, 2).to_bytes(depth, "big")
+    header = struct.pack(">IIBBBBB", 8, 1, depth, 0, 0, 0, 0)
+    parts = (
+        (b"IHDR", header),
+        (b"tRNS", struct.pack(">H", key)),
+        (b"IDAT", zlib.compress(b"\0" + row)),
+    )
+    data = b"".join(chunk(name, body) for name, body in (*parts, (b"IEND", b"")))
+    (tmp_path / "image.png").write_bytes(b"\x89PNG\r\n\x1a\n" + data)
+    image = load(tmp_path / "image.png", background="white")
+    expected = np.where(values == key, 1, values / (2**depth - 1))
+    np.testing.assert_allclose(image.pixels[0, 0], expected, atol=1e-6)
 
 
 @given(background=backgrounds, seed=st.integers(0, 5))

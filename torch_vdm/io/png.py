@@ -73,6 +73,10 @@ def _values(
     grey = kind in (GREY, GREY_ALPHA)
     if kind not in (GREY_ALPHA, RGBA) and "transparency" not in image.info:
         return np.atleast_3d(np.asarray(image.convert("L" if grey else "RGB")))
+    key = image.info.get("transparency")
+    if kind == GREY and depth in (2, 4) and isinstance(key, int):
+        # Pillow spreads the pixels over 8 bits, but not the grey that is clear.
+        image.info["transparency"] = key * 255 // (2**depth - 1)
     values = np.asarray(image.convert("RGBA"))
     return values[..., 2:] if grey else values
 
