@@ -32,6 +32,7 @@ from torch_vdm.cli import (
     UsageError,
     check_outputs,
     json_path,
+    parsed,
     positive,
     run,
     tell,
@@ -58,15 +59,15 @@ LINE_SECONDS = 0.2
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vdm-render``; return its exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    options = _parser().parse_args(words)
-    return run("vdm-render", lambda: _run(options, words))
+    # Scenes and settings are refused with plain ValueErrors.
+    return run("vdm-render", lambda: _run(parsed(_parser(), words), words), (ValueError,))
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="vdm-render",
         description="Render a scene of Mitsuba until nobody can see what is still missing. "
-        "Exit status: 0 done, 2 bad input, 130 interrupted.",
+        "Exit status: 0 done, 2 bad input, 3 internal error, 130 interrupted.",
     )
     parser.add_argument("--version", action="version", version=f"vdm-render {__version__}")
     parser.add_argument("scene", type=Path, metavar="SCENE.xml")

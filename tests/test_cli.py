@@ -7,13 +7,16 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import PIL.Image
 import pytest
 import torch
 
+from tests.test_colour import chunk, with_chunks
+from tests.test_io import ACES, hand_made_exr, png16, rgb, write_exr
 from torch_vdm import VDM, Display, Haar, StationaryHaar, Steerable, __version__
 from torch_vdm.cli import main
 from torch_vdm.cortex import Transform
-from torch_vdm.io import read_image, write_image
+from torch_vdm.io import read_image, write_channels, write_image
 
 Pair = tuple[str, str]
 
@@ -241,7 +244,7 @@ def test_interruption_is_one_line(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torch_vdm.cli.load", interrupted)
+    monkeypatch.setattr("torch_vdm.loading.load", interrupted)
     assert main(["compare", *pair]) == 130
     assert capsys.readouterr().err == "torch-vdm: interrupted\n"
 
@@ -331,3 +334,292 @@ def test_tiles_give_the_same_figures(
     assert told["max_jnd"] == pytest.approx(in_one, abs=1e-5, rel=2e-6)
     np.save(linear, np.full((3, 20, 30), np.nan, np.float32))
     assert "linear.npy: expected finite" in one_line_error(capsys, "compare", linear, linear)
+
+
+# --- Files as people have them --------------------------------------------------------------------
+
+
+def two(folder: Path, suffix: str, *images: torch.Tensor) -> list[str]:
+    """Write images of one name and suffix into folders of their own."""
+    paths = []
+    for number, image in enumerate(images):
+        (folder / str(number)).mkdir(exist_ok=True)
+        paths.append(str(folder / str(number) / f"image{suffix}"))
+        write_image(paths[-1], image)
+    return paths
+
+
+def see_through(path: Path, colours: int, alpha: int) -> str:
+    """Write a PNG of one colour and transparency."""
+    PIL.Image.new("RGBA", (12, 10), (colours, colours, colours, alpha)).save(path)
+    return str(path)
+
+
+@pytest.mark.parametrize(("colours", "alpha"), [(0, 64), (255, 64), (128, 0), (200, 254)])
+def test_transparency_that_differs_is_a_difference(
+    tmp_path: Path, colours: int, alpha: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Whatever the colour: black on black and white on white are seen on the other one.
+    one = see_through(tmp_path / "one.png", colours, 255)
+    other = see_through(tmp_path / "other.png", colours, alpha)
+    told = run_json(capsys, one, other)
+    assert float(str(told["max_jnd"])) > (0.0 if alpha == 254 else 3.0)
+    assert "the transparency of the two differs: compared over black and over" in str(told)
+    single = [
+        float(str(run_json(capsys, one, other, "--background", name)["max_jnd"]))
+        for name in ("black", "white")
+    ]
+    assert told["max_jnd"] == pytest.approx(max(single))
+    told = run_json(capsys, one, other, "--background", "#102030")
+    assert "the transparency of the two differs: compared over #102030 alone" in str(told)
+    assert "--background '#102030'" in str(told["reproduce"])
+
+
+def test_colours_under_nothing_are_no_difference(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = see_through(tmp_path / "one.png", 0, 0)
+    other = see_through(tmp_path / "other.png", 255, 0)
+    told = run_json(capsys, one, other)
+    assert told["max_jnd"] == 0.0
+    assert "shown over black (--background)" in str(told["assumptions"])
+
+
+def test_an_exr_without_alpha_is_compared_with_one_that_has_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # As a denoiser leaves it: the picture over black is the same.
+    image = torch.full((3, 8, 8), 0.5)
+    alpha = torch.full((8, 8), 0.75)
+    write_channels(tmp_path / "one.exr", dict(zip("RGBA", (*image, alpha), strict=True)))
+    write_image(tmp_path / "other.exr", image)
+    paths = [str(tmp_path / name) for name in ("one.exr", "other.exr")]
+    told = run_json(capsys, *paths)
+    assert told["max_jnd"] == 0.0
+    assert "one.exr: It is transparent, and shown over black" in str(told["assumptions"])
+    write_channels(tmp_path / "other.exr", dict(zip("RGBA", (*image, alpha / 2), strict=True)))
+    assert float(str(run_json(capsys, *paths)["max_jnd"])) > 1.0
+
+
+@pytest.mark.parametrize("options", [[], ["--tile", "8"]])
+def test_both_eyes_are_compared(
+    tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    generator = torch.Generator().manual_seed(1)
+    left, right = torch.rand(2, 3, 16, 24, generator=generator).numpy()
+    eyes = {"R": left[0], "G": left[1], "B": left[2]}
+    eyes |= {f"right.{name}": plane for name, plane in zip("RGB", right, strict=True)}
+    paths = []
+    for name, factor in (("one.exr", 1.0), ("other.exr", 1.1)):
+        channels = {key: (p * factor if "." in key else p, 1) for key, p in eyes.items()}
+        views = b"\4\0\0\0left\5\0\0\0right"
+        attributes = {"multiView": ("stringvector", views)}
+        paths.append(str(hand_made_exr(tmp_path / name, channels, attributes=attributes)))
+    told = run_json(capsys, *paths, *options)
+    assert "the views left and right are compared" in str(told["assumptions"])
+    assert "the views" not in str(run_json(capsys, *paths, "--part", "left")["assumptions"])
+    assert run_json(capsys, *paths, "--part", "left")["max_jnd"] == 0.0
+    only = run_json(capsys, *paths, "--part", "right")
+    assert told["max_jnd"] == pytest.approx(only["max_jnd"], abs=1e-5)
+    assert float(str(only["max_jnd"])) > 1.0
+
+
+def test_channels_are_named_on_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    generator = torch.Generator().manual_seed(1)
+    image = torch.rand(3, 8, 9, generator=generator)
+    write_channels(tmp_path / "one.exr", dict(zip(("x", "y.z", "w"), image, strict=True)))
+    write_image(tmp_path / "other.exr", image)
+    paths = [str(tmp_path / name) for name in ("one.exr", "other.exr")]
+    assert "--channels" in one_line_error(capsys, "compare", *paths)
+    line = one_line_error(capsys, "compare", *paths, "--channels", "R=x,G=y.z")
+    assert "expected R=NAME,G=NAME,B=NAME" in line
+    write_channels(tmp_path / "other.exr", dict(zip(("x", "y.z", "w"), image, strict=True)))
+    told = run_json(capsys, *paths, "--channels", "r=x,g=y.z,b=w")
+    assert told["max_jnd"] == 0.0
+    assert "--channels R=x,G=y.z,B=w" in str(told["reproduce"])
+
+
+def test_absolute_light_needs_no_white(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # 58 % of PQ is close to 203 cd/m2 (ITU-R BT.2408-7, table 1).
+    values = np.full((8, 9, 3), round(0.5806 * 65535), np.uint16)
+    data = with_chunks(png16(values, 2, interlaced=False), chunk(b"cICP", bytes((9, 16, 0, 1))))
+    (tmp_path / "pq.png").write_bytes(data)
+    write_image(tmp_path / "white.png", torch.ones(3, 8, 9))
+    write_image(tmp_path / "light.exr", torch.full((3, 8, 9), 2.03))
+    for other in (["white.png", "--peak", "203"], ["light.exr"], ["light.exr", "--white", "100"]):
+        paths = [str(tmp_path / "pq.png"), str(tmp_path / other[0])]
+        told = run_json(capsys, *paths, *other[1:])
+        assert float(str(told["max_jnd"])) < 0.2
+        assert "PNG is absolute light in cd/m2" in str(told["assumptions"])
+
+
+def test_infinity_is_held_to_the_largest_half(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    values = np.full((3, 8, 9), 0.5, np.float16)
+    paths = []
+    for name, largest in (("inf.exr", np.inf), ("max.exr", 65504)):
+        values[:, 4, 4] = largest
+        paths.append(str(write_exr(tmp_path / name, rgb(values))))
+    assert "--nonfinite clamp" in one_line_error(capsys, "compare", *paths)
+    told = run_json(capsys, *paths, "--nonfinite", "clamp")
+    assert told["max_jnd"] == 0.0
+    assert "Infinity was held to 65504" in str(told["assumptions"])
+    assert float(str(run_json(capsys, *paths, "--nonfinite", "zero")["max_jnd"])) > 1.0
+
+
+def test_files_of_one_name_are_told_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = two(tmp_path, ".exr", torch.zeros(3, 8, 9), torch.ones(3, 8, 9))
+    write_channels(paths[0], {name: torch.zeros(8, 9) for name in ("R", "G", "B", "Z")})
+    told = run_json(capsys, *paths)
+    assert f"{paths[0]}: Channels that are not used: Z." in told["assumptions"]  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("dtype", [">u1", ">u2", "<u2", ">f4", ">f8", ">f2", "<f2"])
+def test_arrays_of_any_order_of_bytes(
+    tmp_path: Path, dtype: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    values = np.random.default_rng(1).uniform(0, 1, (3, 8, 9))
+    whole = dtype[1] == "u"
+    stored = np.rint(values * np.iinfo(dtype).max) if whole else values
+    native = np.dtype(dtype).newbyteorder("=")
+    np.save(tmp_path / "one.npy", stored.astype(dtype))
+    np.save(tmp_path / "other.npy", stored.astype(native))
+    told = run_json(capsys, str(tmp_path / "one.npy"), str(tmp_path / "other.npy"))
+    assert told["max_jnd"] == 0.0
+
+
+@pytest.mark.parametrize(
+    "dtype", ["int8", "int16", "int32", "uint32", "int64", "bool", "complex64"]
+)
+def test_arrays_that_are_refused(
+    tmp_path: Path, dtype: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "image.npy", np.zeros((3, 8, 9), dtype))
+    line = one_line_error(capsys, "compare", *[str(tmp_path / "image.npy")] * 2)
+    assert "image.npy: expected numbers of uint8, uint16, float16" in line
+    assert f"got {dtype}" in line
+
+
+def test_floats_may_be_coded(
+    pair: Pair, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = run_json(capsys, *pair)
+    arrays, files = [], []
+    for name, path in zip(("reference", "test"), pair, strict=True):
+        image = read_image(path)
+        arrays.append(str(tmp_path / f"{name}.npy"))
+        np.save(arrays[-1], image.numpy())
+        files.append(str(tmp_path / f"{name}.exr"))
+        write_image(files[-1], image)
+    for paths in (arrays, files, [arrays[0], pair[1]], [files[0], arrays[1]]):
+        told = run_json(capsys, *paths, "--coded")
+        assert told["max_jnd"] == pytest.approx(whole["max_jnd"], abs=1e-5)
+        assert "--coded" in str(told["reproduce"])
+    assert run_json(capsys, *arrays)["max_jnd"] != pytest.approx(whole["max_jnd"], abs=1e-2)
+    aces = write_exr(
+        tmp_path / "aces.exr", rgb(np.ones((3, 20, 30), np.float32)), chromaticities=ACES
+    )
+    line = one_line_error(capsys, "compare", str(aces), files[0], "--coded")
+    assert "leave out --coded" in line
+
+
+def test_neighbours_of_nan_are_found_across_tiles(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    values = np.random.default_rng(1).uniform(0.2, 1, (3, 32, 32)).astype(np.float32)
+    holed = values.copy()
+    holed[1, 16, 15:18] = np.nan
+    holed[0, 15, 16] = np.inf
+    np.save(tmp_path / "one.npy", holed)
+    write_image(tmp_path / "one.exr", torch.from_numpy(holed))
+    np.save(tmp_path / "other.npy", values)
+    paths = [str(tmp_path / name) for name in ("one.npy", "other.npy")]
+    clamp = "--nonfinite", "clamp"
+    figures = [
+        run_json(capsys, first, paths[1], *clamp, *tile)["max_jnd"]
+        for first in (paths[0], str(tmp_path / "one.exr"))
+        for tile in ([], ["--tile", "8"])
+    ]
+    assert figures == pytest.approx([figures[0]] * 4, rel=1e-5)
+
+
+# --- Surroundings ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("redirection", "arguments", "status"),
+    [
+        (">&-", "compare {0} {1}", 0),
+        (">&-", "compare {0} {1} --fail-above 0.5", 1),
+        ("| head -c 0", "compare {0} {1}", 0),
+        ("| head -c 0", "--help", 0),
+        (">&- 2>&- <&-", "compare {0} {1}", 0),
+        ("2>&-", "compare {0} missing.png", 2),
+    ],
+)
+def test_closed_streams_end_quietly(
+    pair: Pair, redirection: str, arguments: str, status: int
+) -> None:
+    words = arguments.format(*(shlex.quote(path) for path in pair))
+    command = f"{shlex.quote(sys.executable)} -m torch_vdm {words} {redirection}"
+    script = f"set -o pipefail; {command}"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, check=False, timeout=120)
+    assert done.returncode == status
+    assert done.stderr == b""
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "words"),
+    [
+        (
+            ValueError("a bug\nof ours"),
+            3,
+            "internal error, ValueError: a bug of ours; please report",
+        ),
+        (RuntimeError("shape"), 3, "internal error, RuntimeError: shape"),
+        (MemoryError(), 3, "not enough memory; make the images smaller, or compare in tiles"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you"), 3, "not enough memory; "),
+        (OSError(12, "Cannot allocate memory"), 3, "not enough memory; make the images smaller"),
+        (OSError(28, "No space left on device"), 2, "output: No space left on device"),
+    ],
+)
+def test_errors_of_our_own_are_not_bad_input(
+    pair: Pair,
+    error: Exception,
+    status: int,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def failing(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("torch_vdm.cli.figures", failing)
+    assert main(["compare", *pair, "--fail-above", "1"]) == status
+    line = capsys.readouterr().err
+    assert line.startswith(f"torch-vdm: {words}")
+    assert line.count("\n") == 1
+
+
+@pytest.mark.parametrize("options", [["--peak", "1e13"], ["--white", "1e-13"], ["--ppd", "1e-9"]])
+def test_options_that_the_model_refuses_are_bad_input(
+    pair: Pair, options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "expected" in one_line_error(capsys, "compare", *pair, *options)
+
+
+def test_only_tiles_need_a_folder(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def none(*_: object, **__: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("tempfile.mkdtemp", none)
+    run_json(capsys, *pair)
+    assert main(["compare", *pair, "--tile", "8"]) == 2
+    assert "Read-only file system" in capsys.readouterr().err

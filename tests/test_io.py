@@ -90,7 +90,7 @@ def box(x: int, y: int, width: int, height: int) -> tuple[Any, Any]:
     return (np.array([x, y], np.int32), np.array([x + width - 1, y + height - 1], np.int32))
 
 
-def rgb(values: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+def rgb(values: NDArray[Any]) -> dict[str, NDArray[Any]]:
     return dict(zip("RGB", values, strict=True))
 
 
@@ -192,7 +192,7 @@ def test_other_channels_are_left_out_and_named(tmp_path: Path) -> None:
     more = {name: planes(1)[0] for name in ("A", "Z", "albedo.R", "albedo.G", "albedo.B")}
     image = load(write_exr(tmp_path / "image.exr", rgb(values) | more))
     np.testing.assert_array_equal(image.pixels, values)
-    assert image.notes == ("Channels that are not used: A, Z, albedo.B, albedo.G, albedo.R.",)
+    assert image.notes[0] == "Channels that are not used: Z, albedo.B, albedo.G, albedo.R."
 
 
 def test_one_channel_is_grey(tmp_path: Path) -> None:
@@ -223,7 +223,8 @@ def test_parts(tmp_path: Path) -> None:
         left=rgb(values[:3]),
         right=rgb(values[3:]),
     )
-    image = load(path)
+    assert "got the layers 'left', 'right'; choose one with --part NAME" in refusal(path)
+    image = load(path, part="left")
     np.testing.assert_array_equal(image.pixels, values[:3])
     assert image.notes == ("Of 4 parts, part 2 ('left') is read.",)
     for part in (3, "right"):
@@ -399,6 +400,54 @@ def test_nonfinite_values(tmp_path: Path) -> None:
     )
 
 
+def clamped(values: NDArray[Any], largest: float) -> NDArray[np.float32]:
+    """Return a plane with infinity held and NaN filled, one value after another."""
+    out = values.astype(np.float32)
+    for y, x in np.ndindex(values.shape):
+        if np.isnan(values[y, x]):
+            near = values[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2].astype(np.float64)
+            near = near[np.isfinite(near)]
+            out[y, x] = near.mean() if near.size else 0
+        elif np.isinf(values[y, x]):
+            out[y, x] = np.sign(values[y, x]) * largest
+    return out
+
+
+@given(
+    half=st.booleans(),
+    bad=st.lists(
+        st.tuples(
+            st.integers(0, 2),
+            st.integers(0, 4),
+            st.integers(0, 5),
+            st.sampled_from([np.nan, np.inf, -np.inf]),
+        ),
+        min_size=1,
+        max_size=60,
+    ),
+)
+def test_infinity_is_held_and_nan_filled(
+    half: bool,
+    bad: list[tuple[int, int, int, float]],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    values = planes(3, 5, 6).astype(np.float16 if half else np.float32)
+    for channel, y, x, value in bad:
+        values[channel, y, x] = value
+    path = write_exr(tmp_path_factory.getbasetemp() / "clamp.exr", rgb(values))
+    image = load(path, nonfinite="clamp", negative="keep")
+    largest = 65504 if half else float(np.finfo(np.float32).max)
+    expected = [clamped(plane, largest) for plane in values]
+    np.testing.assert_allclose(image.pixels, expected, rtol=1e-6)
+    assert image.notes[0].startswith(f"Infinity was held to {largest:g} and NaN to its neighbours'")
+
+
+def test_an_overflow_of_conversion_is_held_too(tmp_path: Path) -> None:
+    values = np.full((3, 4, 4), np.inf, np.float32)
+    path = write_exr(tmp_path / "image.exr", rgb(values), chromaticities=XYZ)
+    assert load(path, nonfinite="clamp").pixels.isfinite().all()
+
+
 def test_nonfinite_values_that_are_not_shown_do_not_matter(tmp_path: Path) -> None:
     values = planes()
     values[:, 0, 0] = np.nan
@@ -441,6 +490,18 @@ def test_negative_values(tmp_path: Path) -> None:
     assert "2 negative values" in image.notes[0]
 
 
+def test_negatives_that_conversion_makes_are_colours(tmp_path: Path) -> None:
+    values = planes()
+    values[:, 3, 4] = 0, 1, 0  # green of ACES, which BT.709 lacks
+    path = write_exr(tmp_path / "image.exr", rgb(values), chromaticities=ACES)
+    for negative in ("raise", "clip", "keep"):
+        image = load(path, negative=negative)
+        np.testing.assert_allclose(image.pixels[:, 3, 4], ACES_TO_BT709[:, 1], atol=1e-3)
+    values[0, 7, 3] = -0.25  # the file's own is refused, before it is converted
+    path = write_exr(tmp_path / "image.exr", rgb(values), chromaticities=ACES)
+    assert "got 1 negative value (the first at x=3, y=7; the lowest is -0.25)" in refusal(path)
+
+
 @pytest.mark.parametrize("options", [{"nonfinite": "mask"}, {"negative": "zero"}])
 def test_unknown_policies_are_refused(tmp_path: Path, options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="to be one of"):
@@ -477,40 +538,30 @@ def png16(values: NDArray[np.uint16], kind: int, *, interlaced: bool) -> bytes:
 
 
 @pytest.mark.parametrize("interlaced", [False, True])
-@pytest.mark.parametrize(("kind", "count"), [(0, 1), (2, 3), (6, 4)])
+@pytest.mark.parametrize(("kind", "count"), [(0, 1), (2, 3), (4, 2), (6, 4)])
 def test_png_of_16_bits_keeps_them(tmp_path: Path, kind: int, count: int, interlaced: bool) -> None:
     values = np.random.default_rng(1).integers(0, 2**16, (9, 13, count), np.uint16)
     path = tmp_path / "image.png"
     path.write_bytes(png16(values, kind, interlaced=interlaced))
     image = load(path)
-    expected = np.moveaxis(values[..., :3], -1, 0).astype(np.float32) / np.float32(65535)
+    expected = np.moveaxis(values, -1, 0).astype(np.float32) / np.float32(65535)
+    if kind in (4, 6):  # over black
+        np.testing.assert_array_equal(image.alpha, expected[-1])
+        expected = expected[:-1] * expected[-1]
     np.testing.assert_array_equal(image.pixels, np.broadcast_to(expected, (3, 9, 13)))
     assert not image.linear
     assert "The channels have 16 bits." in image.notes
-
-
-def test_png_of_16_bits_grey_with_alpha_says_what_is_lost(tmp_path: Path) -> None:
-    values = np.random.default_rng(1).integers(0, 2**16, (9, 13, 2), np.uint16)
-    path = tmp_path / "image.png"
-    path.write_bytes(png16(values, 4, interlaced=False))
-    image = load(path)
-    np.testing.assert_allclose(image.pixels[0], values[..., 0] / 65535, atol=1 / 255)
-    assert "The channels have 16 bits, of which 8 are kept." in image.notes
 
 
 @pytest.mark.parametrize(
     ("mode", "options", "note"),
     [
         ("RGB", {}, None),
-        ("RGBA", {}, "The transparency is left out: colours are taken as they stand in the file."),
+        ("RGBA", {}, None),
         ("L", {}, "The image is grey: R = G = B."),
         ("LA", {}, "The image is grey: R = G = B."),
         ("1", {}, "The image is grey: R = G = B."),
         ("P", {}, None),
-        ("P", {"transparency": b"\0\x80"}, "The transparency is left out: colours are taken as"),
-        ("L", {"transparency": 7}, "The transparency is left out: colours are taken as"),
-        ("RGB", {"icc_profile": b"Display P3"}, "The file has a colour profile that is not sRGB;"),
-        ("RGB", {"icc_profile": b"s\0R\0G\0B\0 IEC"}, None),
     ],
 )
 def test_png_is_read_as_pillow_reads_it(
@@ -578,8 +629,8 @@ def test_paths_without_an_image_are_refused(tmp_path: Path) -> None:
     assert refusal(tmp_path / "text.exr").endswith(
         "(it begins with bytes 6e 6f 74 20); export it again"
     )
-    (tmp_path / "image.tiff").write_text("II*\0")
-    assert refusal(tmp_path / "image.tiff").endswith("convert it to one of them")
+    (tmp_path / "image.psd").write_text("8BPS")
+    assert refusal(tmp_path / "image.psd").endswith("convert it to one of them")
     with pytest.raises(ImageError, match="null byte"):
         load("a\0b.exr")
 
@@ -667,7 +718,7 @@ FUZZ = """
     from pathlib import Path
     import torch_vdm.io as images
 
-    imported = [name for name in ("OpenEXR", "PIL", "kornia_rs") if name in sys.modules]
+    imported = [name for name in ("OpenEXR", "PIL", "kornia_rs", "tifffile") if name in sys.modules]
     base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     rng = random.Random(1)
     scratch, cases, *files = sys.argv[1:]
@@ -691,7 +742,7 @@ FUZZ = """
         begin = time.perf_counter()
         try:
             pixels = images.load(path, nonfinite="zero", negative="clip", quiet=True).pixels
-            assert pixels.ndim == 3 and pixels.isfinite().all() and (pixels >= 0).all()
+            assert pixels.ndim == 3 and pixels.isfinite().all()
             message = ""
         except images.ImageError as error:
             message = str(error)

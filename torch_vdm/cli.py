@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import errno
 import io
 import math
 import os
@@ -10,33 +11,28 @@ import shlex
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 import torch
 from torch import Tensor
 
 from torch_vdm import __version__
 from torch_vdm.cortex import Haar, StationaryHaar, Steerable, Transform
-from torch_vdm.display import (
-    BT709_TO_XYZ,
-    Display,
-    decode_srgb,
-    encode_srgb,
-    pixels_per_degree,
-)
-from torch_vdm.io import ArrayFile, ImageError, atomic_path, check_target, load, write_image
-from torch_vdm.io.arrays import MAGIC
+from torch_vdm.display import pixels_per_degree
+from torch_vdm.io import ImageError, atomic_path, check_target, write_image
+from torch_vdm.io.alpha import colour
+from torch_vdm.io.refusal import printable
+from torch_vdm.loading import Pair, displays_of, load_pairs
 from torch_vdm.observer import Observer
-from torch_vdm.report import BAND, Comparison, figures, shrunk, table, write_heat_map
-from torch_vdm.tiling import SMALLEST_TILE, TILE, Source, read
+from torch_vdm.report import Comparison, figures, table, write_heat_map
+from torch_vdm.tiling import SMALLEST_TILE, TILE, read
 from torch_vdm.vdm import VDM
 
-DONE, EXCEEDED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+DONE, EXCEEDED, BAD_INPUT, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130
 
 # Assumed where nothing is given; each is printed. Status: choice. 60 pixels per degree is a
 # 27-inch screen of 3840 x 2160 from 0.53 m; 100 cd/m2 is the white of BT.1886 and Display.srgb.
@@ -85,28 +81,80 @@ class Parser(argparse.ArgumentParser):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``torch-vdm``; return its exit status."""
-    options = _parser().parse_args(arguments)
-    return run("torch-vdm", lambda: _command(options))
+    return run("torch-vdm", lambda: _command(parsed(_parser(), arguments)))
 
 
-def run(program: str, command: Callable[[], int]) -> int:
+def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Return the options; help and version are printed, whether or not anybody reads them."""
+    try:
+        return parser.parse_args(arguments)
+    except SystemExit:
+        tell("")
+        raise
+
+
+def run(
+    program: str,
+    command: Callable[[], int],
+    refusals: tuple[type[ValueError], ...] = (ImageError, UsageError),
+) -> int:
     """Run a command; return its exit status, for an error after one line that begins with its name.
 
-    ``command`` returns the status of a run without an error.
+    ``command`` returns the status of a run without an error; ``refusals`` are the errors that mean
+    bad input. All others are the program's own: 3, and never 1, which says that something was
+    exceeded.
     """
+    _keep_standard_numbers()
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A file's name may have letters that the terminal lacks.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         return command()
-    except ValueError as error:  # of the library, one line each; ImageError is one
-        print(f"{program}: {error}", file=sys.stderr)
+    except refusals as error:  # of the library, one line each
+        return _ended(program, str(error), BAD_INPUT)
     except OSError as error:
-        print(f"{program}: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
+        if error.errno == errno.ENOMEM:
+            return _ended(program, _internal(MemoryError()), INTERNAL)
+        return _ended(program, f"{error.filename or 'output'}: {error.strerror}", BAD_INPUT)
     except KeyboardInterrupt:
-        print(f"{program}: interrupted", file=sys.stderr)
-        return INTERRUPTED
-    return BAD_INPUT
+        return _ended(program, "interrupted", INTERRUPTED)
+    except Exception as error:
+        return _ended(program, _internal(error), INTERNAL)
+
+
+def _ended(program: str, why: str, status: int) -> int:
+    """Return the status, after one line on standard error if anybody reads that."""
+    if sys.stderr is not None:
+        with contextlib.suppress(OSError):
+            print(f"{program}: {why}", file=sys.stderr)
+    return status
+
+
+def _internal(error: Exception) -> str:
+    """One line for an error that is not the user's."""
+    text = printable(" ".join(str(error).split()))
+    # PyTorch says so in words.
+    if isinstance(error, MemoryError) or ("alloc" in text and "memory" in text):
+        why = text if isinstance(error, MemoryError) and text else "not enough memory"
+        return f"{why}; make the images smaller, or compare in tiles (--tile {TILE})"
+    return f"internal error, {type(error).__name__}: {text}; please report it with the images"
+
+
+def _keep_standard_numbers() -> None:
+    """Let no file that is opened later take the number of a closed standard stream."""
+    number = os.open(os.devnull, os.O_RDWR)
+    while number <= 2:
+        number = os.open(os.devnull, os.O_RDWR)
+    os.close(number)
+
+
+@contextlib.contextmanager
+def _usage() -> Iterator[None]:
+    """Take a value that the model refuses for what it is: an option."""
+    try:
+        yield
+    except ValueError as error:
+        raise UsageError(str(error)) from error
 
 
 def _command(options: argparse.Namespace) -> int:
@@ -127,8 +175,9 @@ def _parser() -> argparse.ArgumentParser:
     compare = commands.add_parser(
         "compare",
         help="compare a test image with a reference",
-        description="Compare two images of one size, PNG, JPEG, EXR or NPY, in just-noticeable "
-        "differences. Exit status: 0 done, 1 --fail-above exceeded, 2 bad input.",
+        description="Compare two images of one size in just-noticeable differences: EXR, PNG, "
+        "JPEG, HDR, PFM, TIFF, WebP, BMP, PNM, TGA, GIF, AVIF or NPY. Exit status: 0 done, "
+        "1 --fail-above exceeded, 2 bad input, 3 internal error or not enough memory.",
     )
     compare.add_argument("reference", type=Path, metavar="REFERENCE")
     compare.add_argument("test", type=Path, metavar="TEST")
@@ -157,14 +206,14 @@ def _add_options(parser: argparse.ArgumentParser, map_path: Path | None) -> None
         type=positive,
         default=WHITE,
         metavar="CD_M2",
-        help=f"luminance of white in PNG and JPEG ({WHITE:g})",
+        help=f"luminance of white in sRGB-coded files, PNG and JPEG among them ({WHITE:g})",
     )
     light.add_argument(
         "--white",
         type=positive,
         default=WHITE,
         metavar="CD_M2",
-        help=f"luminance of 1.0 in EXR ({WHITE:g})",
+        help=f"luminance of 1.0 in files of light, EXR among them ({WHITE:g})",
     )
     light.add_argument(
         "--exposure", type=_stops, default=0.0, metavar="STOPS", help="multiply the light by 2^F"
@@ -186,9 +235,42 @@ def _add_options(parser: argparse.ArgumentParser, map_path: Path | None) -> None
         f"{TILE} over {LARGEST_WHOLE / 1e6:.0f} megapixels, below none",
     )
     reading = parser.add_argument_group("reading")
-    reading.add_argument("--part", metavar="NAME", help="part of a multi-part EXR, name or number")
-    reading.add_argument("--nonfinite", choices=("raise", "zero"), default="raise")
-    reading.add_argument("--negative", choices=("raise", "clip", "keep"), default="raise")
+    reading.add_argument(
+        "--part",
+        metavar="NAME",
+        help="part, layer or view of an EXR: a name, its last word, or a number",
+    )
+    reading.add_argument(
+        "--channels",
+        type=_channels,
+        metavar="R=...,G=...,B=...",
+        help="the channels of an EXR to take",
+    )
+    reading.add_argument(
+        "--background",
+        type=_background,
+        metavar="COLOUR",
+        help="behind transparent images: black, white, grey or #rrggbb (black, and white too where "
+        "the transparency of the two differs)",
+    )
+    reading.add_argument(
+        "--coded",
+        action="store_true",
+        help="floating-point values are sRGB-coded, not light",
+    )
+    reading.add_argument(
+        "--nonfinite",
+        choices=("raise", "zero", "clamp"),
+        default="raise",
+        help="NaN and infinity: refused (default); 0; or infinity as the largest value of the "
+        "channel's type and NaN as its neighbours' mean",
+    )
+    reading.add_argument(
+        "--negative",
+        choices=("raise", "clip", "keep"),
+        default="raise",
+        help="negative light in the file: refused (default), 0, or kept",
+    )
     output = parser.add_argument_group("output")
     output.add_argument(
         "--map", type=_map_path, default=map_path, metavar="OUT.png|OUT.exr", help="the heat map"
@@ -199,87 +281,33 @@ def _add_options(parser: argparse.ArgumentParser, map_path: Path | None) -> None
     )
 
 
-@dataclass(frozen=True)
-class _Pair:
-    """Two images made ready for one display."""
-
-    reference: Source
-    test: Source
-    display: Display
-    assumptions: list[str]
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width."""
-        height, width = self.reference.shape[-2:]
-        return height, width
-
-    def luminances(self) -> tuple[float, float]:
-        """Return the mean luminance of reference and test, in cd/m2."""
-        matrix = torch.tensor(BT709_TO_XYZ, dtype=torch.float64)
-        height, width = self.size
-        rows = max(1, BAND // width)
-        sums = [0.0, 0.0]
-        for top in range(0, height, rows):
-            band = slice(top, min(top + rows, height)), slice(0, width)
-            for number, image in enumerate((self.reference, self.test)):
-                xyz = self.display.to_xyz(read(image, 0, band).double(), matrix)
-                sums[number] += xyz[0, 1].sum().item()
-        return sums[0] / (height * width), sums[1] / (height * width)
-
-    def coded(self) -> tuple[Tensor, Tensor]:
-        """Return reference and test as sRGB-coded images, small enough for a picture of them."""
-        reference, test = shrunk(self.reference), shrunk(self.test)
-        if self.display.encoding == "srgb" and self.display.exposure == 0.0:
-            return reference, test
-        scale = 2.0**self.display.exposure
-        linear = (
-            decode_srgb(image) if self.display.encoding == "srgb" else image
-            for image in (reference, test)
-        )
-        reference, test = (encode_srgb(image * scale) for image in linear)
-        return reference, test
-
-
-@dataclass(frozen=True)
-class _Linear:
-    """An sRGB-coded source as linear values, of which 1.0 is ``white`` where 1.0 was coded."""
-
-    source: Source
-    white: float
-
-    @property
-    def shape(self) -> Sequence[int]:
-        """(3, H, W)."""
-        return self.source.shape
-
-    def __getitem__(self, index: tuple[slice, slice, slice], /) -> Tensor:
-        """Return a part."""
-        return decode_srgb(read(self.source, 0, index[1:])[0]) * self.white
-
-
 def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
-    # For the map of a large image; one that cannot be removed is not worth a failure.
-    with tempfile.TemporaryDirectory(prefix="torch-vdm-", ignore_cleanup_errors=True) as room:
-        return _compare_with(Path(room), reference, test, options)
+    # For the maps of large images; one that cannot be removed is not worth a failure.
+    with contextlib.ExitStack() as rooms:
+        return _compare_with(rooms, reference, test, options)
 
 
-def _compare_with(room: Path, reference: Path, test: Path, options: argparse.Namespace) -> int:
+def _compare_with(
+    rooms: contextlib.ExitStack, reference: Path, test: Path, options: argparse.Namespace
+) -> int:
     check_outputs((reference, test), (options.map, json_path(options)))
-    ppd, seen_from = _viewing(options)
+    with _usage():
+        ppd, seen_from = _viewing(options)
+        displays = displays_of(options)
     options.accuracy = options.accuracy or ACCURACY[options.observer]
-    pair = _load_pair(reference, test, options)
-    transform = TRANSFORMS[options.accuracy]()
-    metric = VDM(ppd, pair.display, OBSERVERS[options.observer](), transform)
+    pairs, assumptions = load_pairs(reference, test, displays, options)
+    with _usage():
+        transform = TRANSFORMS[options.accuracy]()
+        metric = VDM(ppd, pairs[0].display, OBSERVERS[options.observer](), transform)
     tile = options.tile
-    if tile is None and math.prod(pair.size) > LARGEST_WHOLE:
+    if tile is None and math.prod(pairs[0].size) > LARGEST_WHOLE:
         tile = TILE
     start = time.perf_counter()
-    jnd = _in_tiles(metric, pair, tile, room) if tile else _whole(metric, pair)
+    jnd, pair = _largest(metric, pairs, tile, rooms)
     seconds = time.perf_counter() - start
     luminances = pair.luminances()
     told = figures(jnd)
-    assumptions = [seen_from, *pair.assumptions]
+    assumptions = [seen_from, *assumptions]
     if options.accuracy == "fast" and options.observer == "calibrated":
         assumptions.append(MAY_MISS)
     comparison = Comparison(
@@ -312,7 +340,20 @@ def _compare_with(room: Path, reference: Path, test: Path, options: argparse.Nam
     return EXCEEDED if exceeded else DONE
 
 
-def _whole(metric: VDM, pair: _Pair) -> Tensor:
+def _largest(
+    metric: VDM, pairs: Sequence[Pair], tile: int | None, rooms: contextlib.ExitStack
+) -> tuple[Tensor, Pair]:
+    """Return the map (H, W) of the pairs' larger difference, and the pair that shows most."""
+    maps = [
+        _in_tiles(metric, pair, tile, rooms) if tile else _whole(metric, pair) for pair in pairs
+    ]
+    maxima = [jnd.max().item() for jnd in maps]
+    for other in maps[1:]:
+        torch.maximum(maps[0], other, out=maps[0])
+    return maps[0], pairs[maxima.index(max(maxima))]
+
+
+def _whole(metric: VDM, pair: Pair) -> Tensor:
     """Return the map (H, W)."""
     height, width = pair.size
     everything = slice(0, height), slice(0, width)
@@ -322,12 +363,14 @@ def _whole(metric: VDM, pair: _Pair) -> Tensor:
     return jnd
 
 
-def _in_tiles(metric: VDM, pair: _Pair, tile: int, room: Path) -> Tensor:
-    """Return the same, with a progress bar on a terminal; the map lies in a file in ``room``."""
+def _in_tiles(metric: VDM, pair: Pair, tile: int, rooms: contextlib.ExitStack) -> Tensor:
+    """Return the same, with a progress bar on a terminal; the map lies in a file."""
     from rich.console import Console
     from rich.progress import Progress
 
     size = pair.size
+    folder = tempfile.TemporaryDirectory(prefix="torch-vdm-", ignore_cleanup_errors=True)
+    room = Path(rooms.enter_context(folder))
     jnd = torch.from_file(str(room / "map"), shared=True, size=math.prod(size)).view(1, *size)
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
@@ -365,7 +408,9 @@ def json_path(options: argparse.Namespace) -> Path | None:
 
 
 def tell(text: str) -> None:
-    """Print, and do not mind a reader that has read enough."""
+    """Print, and do not mind a reader that has read enough, or none at all."""
+    if sys.stdout is None:
+        return
     try:
         sys.stdout.write(text)
         sys.stdout.flush()
@@ -395,65 +440,6 @@ def _viewing(options: argparse.Namespace) -> tuple[float, str]:
     return PPD, f"{PPD:g} pixels per degree, for nothing was given (--ppd)"
 
 
-class _Opened(NamedTuple):
-    """An image in memory, or an array on a disk, and what was assumed to read it."""
-
-    pixels: Source
-    linear: bool
-    notes: tuple[str, ...]
-
-
-def _open(path: Path, options: argparse.Namespace) -> _Opened:
-    if _is_array(path):
-        array = ArrayFile(path, options.nonfinite, options.negative)
-        return _Opened(array, array.linear, array.notes)
-    image = load(
-        path,
-        part=_part(options.part),
-        nonfinite=options.nonfinite,
-        negative=options.negative,
-        quiet=True,
-    )
-    return _Opened(image.pixels, image.linear, image.notes)
-
-
-def _is_array(path: Path) -> bool:
-    # What cannot be opened is `load`'s to tell of; opening a pipe would wait for ever.
-    with contextlib.suppress(OSError, ValueError):
-        if path.is_file():
-            with path.open("rb") as file:
-                return file.read(len(MAGIC)) == MAGIC
-    return False
-
-
-def _load_pair(reference: Path, test: Path, options: argparse.Namespace) -> _Pair:
-    """Read both images and bring them to one display; an array is read later, part by part."""
-    images = [_open(path, options) for path in (reference, test)]
-    shapes = [tuple(image.pixels.shape) for image in images]
-    if shapes[0] != shapes[1]:
-        sizes = [f"{shape[2]} x {shape[1]}" for shape in shapes]
-        raise ImageError(
-            f"{test}: expected the size of {reference}, {sizes[0]}, got {sizes[1]}; "
-            "crop or scale one of them"
-        )
-    assumptions = []
-    if any(image.linear for image in images):
-        assumptions.append(f"EXR is linear BT.709, and 1.0 is {options.white:g} cd/m2 (--white)")
-    if not all(image.linear for image in images):
-        assumptions.append(f"PNG and JPEG are sRGB, and white is {options.peak:g} cd/m2 (--peak)")
-    assumptions.append(f"exposure {options.exposure:+g} stops (--exposure)")
-    for path, image in zip((reference, test), images, strict=True):
-        assumptions += [f"{path.name}: {note}" for note in image.notes]
-    if not any(image.linear for image in images):
-        display = Display.srgb(options.peak, options.exposure)
-        return _Pair(images[0].pixels, images[1].pixels, display, assumptions)
-    scale = options.peak / options.white
-    one, other = (
-        image.pixels if image.linear else _Linear(image.pixels, scale) for image in images
-    )
-    return _Pair(one, other, Display.linear(options.white, options.exposure), assumptions)
-
-
 def _reproduce(
     reference: Path, test: Path, ppd: float, tile: int | None, options: argparse.Namespace
 ) -> str:
@@ -467,6 +453,12 @@ def _reproduce(
         words += ["--tile", str(tile)]
     if options.part is not None:
         words += ["--part", options.part]
+    if options.channels is not None:
+        words += ["--channels", ",".join(f"{key}={name}" for key, name in options.channels.items())]
+    if options.background is not None:
+        words += ["--background", options.background]
+    if options.coded:
+        words.append("--coded")
     return shlex.join(words)
 
 
@@ -504,8 +496,20 @@ def _text(
     return console.file.getvalue()
 
 
-def _part(text: str | None) -> int | str | None:
-    return int(text) if text is not None and text.isdecimal() else text
+def _channels(text: str) -> Mapping[str, str]:
+    pairs = [part.partition("=") for part in text.split(",")]
+    named = {key.strip().upper(): name for key, _, name in pairs}
+    if not {"R", "G", "B"} <= set(named) <= {"R", "G", "B", "A"} or "" in named.values():
+        raise argparse.ArgumentTypeError(f"expected R=NAME,G=NAME,B=NAME, got {text!r}")
+    return named
+
+
+def _background(text: str) -> str:
+    try:
+        colour(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text
 
 
 def number(text: str, what: str, low: float, high: float = math.inf) -> float:

@@ -1,4 +1,4 @@
-"""Images from files and to files: OpenEXR, PNG and JPEG."""
+"""Images from files and to files; docs/files.md says which."""
 
 from torch_vdm.io.arrays import ArrayFile
 from torch_vdm.io.files import (

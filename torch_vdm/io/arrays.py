@@ -7,12 +7,12 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_vdm.io.refusal import ImageError, require_finite, without_negatives
+from torch_vdm.io.refusal import ImageError, Negative, Nonfinite, require_finite, without_negatives
 
 MAGIC = b"\x93NUMPY"
 
-# What is taken: whole numbers from 0 to white, and light.
-CODED, LINEAR = ("uint8", "uint16"), ("float16", "float32", "float64")
+# What is taken: whole numbers from 0 to white, and light or, if asked for, code.
+WHOLE, FLOATS = ("uint8", "uint16"), ("float16", "float32", "float64")
 
 
 class ArrayFile:
@@ -24,7 +24,7 @@ class ArrayFile:
     ----------
     path
         The file, of uint8 or uint16 (sRGB-coded, 0 to white) or float16, 32 or 64 (linear).
-    nonfinite, negative
+    nonfinite, negative, coded
         As in `torch_vdm.io.load`, for the parts that are read.
 
     Raises
@@ -35,39 +35,66 @@ class ArrayFile:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], nonfinite: str = "raise", negative: str = "keep"
+        self,
+        path: str | os.PathLike[str],
+        nonfinite: Nonfinite = "raise",
+        negative: Negative = "keep",
+        coded: bool = False,
     ) -> None:
         self.path = Path(path)
         self.nonfinite, self.negative = nonfinite, negative
         array = self._array()
         self.shape = tuple(int(side) for side in array.shape)
-        self.linear = array.dtype.name in LINEAR
-        if array.dtype.name not in CODED + LINEAR:
-            self._refuse(f"expected numbers of {', '.join(CODED + LINEAR)}, got {array.dtype}")
+        self.floating = array.dtype.name in FLOATS
+        self.linear = self.floating and not coded
+        if array.dtype.name not in WHOLE + FLOATS:
+            self._refuse(
+                f"expected numbers of {', '.join(WHOLE + FLOATS)}, got {array.dtype}; scale them "
+                "to one of these"
+            )
         if len(self.shape) != 3 or self.shape[0] != 3 or 0 in self.shape:
             self._refuse(f"expected a shape (3, H, W) or (H, W, 3), got {array.shape}")
 
     def __getitem__(self, index: Any, /) -> NDArray[Any]:
         """Return a part, of slices for channels, rows and columns, as an array in memory."""
-        part = np.array(self._array()[index])
-        if not self.linear:
-            return part
+        stored = self._array()
+        native = stored.dtype.newbyteorder("=")
+        if not self.floating:
+            whole: NDArray[Any] = stored[index].astype(native)
+            return whole
+        # With their neighbours, where NaN is to take the mean of these.
+        margin = 1 if self.nonfinite == "clamp" else 0
+        begins = [max(0, (side.start or 0) - margin) for side in index[1:]]
+        wide = [
+            slice(begin, None if side.stop is None else side.stop + margin)
+            for begin, side in zip(begins, index[1:], strict=True)
+        ]
         said: list[str] = []  # not used: a part is read more than once, see `notes`
-        rows, columns = index[-2:]
-        origin = columns.start or 0, rows.start or 0
+        origin = begins[1], begins[0]
         try:
+            part = stored[(index[0], *wide)].astype(native)
             part = require_finite(part, self.nonfinite, said, origin)
-            return without_negatives(part, self.negative, said, origin)
+            part = without_negatives(part, self.negative, said, origin)
         except ImageError as error:
             raise ImageError(f"{self.path}: {error}") from None
+        inner = [
+            slice((side.start or 0) - begin, None if side.stop is None else side.stop - begin)
+            for begin, side in zip(begins, index[1:], strict=True)
+        ]
+        return part[(slice(None), *inner)]
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What was assumed, one sentence each."""
-        told = [f"{'Linear' if self.linear else 'sRGB-coded'} for its type; read part by part."]
-        if self.linear and self.nonfinite == "zero":
+        why = "as asked for (--coded)" if self.floating and not self.linear else "for its type"
+        told = [f"{'Linear' if self.linear else 'sRGB-coded'} {why}; read part by part."]
+        if self.floating and self.nonfinite == "zero":
             told.append("0 is put in the place of NaN and infinity.")
-        if self.linear and self.negative == "clip":
+        if self.floating and self.nonfinite == "clamp":
+            told.append(
+                "Infinity is held to the type's largest value, NaN to its neighbours' mean."
+            )
+        if self.floating and self.negative == "clip":
             told.append("0 is put in the place of negative values.")
         return tuple(told)
 

@@ -11,101 +11,55 @@ OpenEXR is imported where it is used: importing the package stays fast.
 import io
 import struct
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from torch_vdm.io.exr_colour import BT709, colours
+from torch_vdm.io.decoded import Decoded
+from torch_vdm.io.exr_colour import colours, transparency
 from torch_vdm.io.exr_header import (
     LONG_NAMES,
     TILED,
+    Bytes,
     Part,
     damaged,
-    listed,
     read_headers,
     short,
     value_of,
 )
-from torch_vdm.io.refusal import Floats, ImageError, check_size
+from torch_vdm.io.exr_layers import choose
+from torch_vdm.io.primaries import BT709
+from torch_vdm.io.refusal import Floats, ImageError, Repair, check_size
 
 # Rows in a block of a scanline part, by the number of the compression: none, RLE, ZIPS, ZIP, PIZ,
 # PXR24, B44, B44A, DWAA, DWAB, HTJ2K256, HTJ2K32, LJ2K, ZSTD.
 _BLOCK_ROWS = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256, 256, 32, 256, 1)
 
-# Channels that make an image, in the order in which they are looked for.
-_MODELS = (("R", "G", "B"), ("Y", "RY", "BY"), ("X", "Y", "Z"), ("Y",))
+
+class Choice(NamedTuple):
+    """Which of a file's images is asked for; None: the one that looks like the picture."""
+
+    part: int | str | None = None
+    view: str | None = None
+    channels: Mapping[str, str] | None = None
 
 
-def load_exr(data: bytes, wanted: int | str | None, nonfinite: str, notes: list[str]) -> Floats:
-    """Return the linear BT.709 pixels, (3, H, W); what was assumed goes to ``notes``."""
+def load_exr(data: Bytes, choice: Choice, repair: Repair, coded: bool, notes: list[str]) -> Decoded:
+    """Return the linear BT.709 pixels; what was assumed goes to ``notes``.
+
+    With ``coded`` the values are sRGB-coded, and stay so.
+    """
     parts, table, long_names = read_headers(data)
-    index, names = _choose(parts, wanted, notes)
-    part = parts[index]
+    layer, views = choose(parts, *choice, notes)
+    part = parts[layer.part]
     _check(part, len(data))
-    for other in parts[:index]:
+    for other in parts[: layer.part]:
         table += 8 * value_of(other.attributes, "chunkCount", "<i")[0]
-    blocks = _blocks(data, part, table, index if len(parts) > 1 else None)
-    planes = _decoded(_one_part(part, blocks, long_names), names)
-    return colours(part, names, planes, nonfinite, notes)
-
-
-def _choose(
-    parts: list[Part], wanted: int | str | None, notes: list[str]
-) -> tuple[int, tuple[str, ...]]:
-    """The index of the part to read, and the names of the channels to read from it."""
-    everything = range(len(parts))
-    found = [_channel_names(part) for part in parts]
-    if isinstance(wanted, int):
-        if wanted not in everything:
-            raise ImageError(f"expected a part from 0 to {len(parts) - 1}, got {wanted}")
-        candidates = [wanted]
-    elif wanted is None:
-        candidates = [i for i in everything if found[i]]
-        # A stable sort: parts that have plain R, G, B come first, deep ones last.
-        candidates.sort(key=lambda i: (parts[i].deep, found[i] != _MODELS[0]))
-    else:
-        candidates = [i for i in everything if parts[i].name == wanted]
-        if not candidates:
-            found = [_channel_names(part, wanted) for part in parts]
-            candidates = [i for i in everything if found[i]]
-        if not candidates:
-            raise ImageError(
-                f"expected a part or a layer named {short(wanted)!r}, got parts "
-                f"{listed([repr(part.name) for part in parts])}"
-            )
-    index = candidates[0] if candidates else 0
-    part, names = parts[index], found[index]
-    if part.deep:
-        raise ImageError(
-            "expected one sample a pixel, got a deep image; flatten it where it is rendered"
-        )
-    if not names:
-        raise ImageError(
-            f"expected channels R, G, B, or Y, RY, BY, or Y, got {listed(list(part.channels))}; "
-            "export it with colour channels"
-        )
-    if len(parts) > 1:
-        notes.append(f"Of {len(parts)} parts, part {index} ({short(part.name)!r}) is read.")
-    if "." in names[0]:
-        notes.append(f"The image is read from the channels {listed(list(names))}.")
-    if any(part.channels[name].kind == 0 for name in names):
-        notes.append("The channels hold whole numbers, which are taken as they are.")
-    others = [name for name in part.channels if name not in names]
-    if others:
-        notes.append(f"Channels that are not used: {listed(others)}.")
-    return index, names
-
-
-def _channel_names(part: Part, layer: str | None = None) -> tuple[str, ...]:
-    """The channels that make the image, or the given layer; empty if there are none."""
-    layers = [layer] if layer is not None else [""]
-    if layer is None:
-        layers += [name[:-2] for name in part.channels if name.endswith(".R")]
-    for prefix in layers:
-        for model in _MODELS if prefix in ("", layer) else _MODELS[:1]:
-            names = tuple(f"{prefix}.{name}" if prefix else name for name in model)
-            if all(name in part.channels for name in names):
-                return names
-    return ()
+    blocks = _blocks(data, part, table, layer.part if len(parts) > 1 else None)
+    decoded = _decoded(_one_part(part, blocks, long_names))
+    image = colours(part, layer, decoded, repair, coded, notes)
+    alpha = None if layer.alpha is None else transparency(part, layer.alpha, decoded, notes)
+    return Decoded(image, "coded" if coded else "scene", alpha, True, views)
 
 
 def _check(part: Part, size: int) -> None:
@@ -135,9 +89,7 @@ def _check(part: Part, size: int) -> None:
         check_size(columns, rows, columns * rows * 4 * len(part.channels), size)
 
 
-def _blocks(
-    data: bytes, part: Part, table: int, index: int | None
-) -> list[tuple[bytes, memoryview]]:
+def _blocks(data: Bytes, part: Part, table: int, index: int | None) -> list[tuple[bytes, bytes]]:
     """Every block of the full-resolution image: where it stands in it, and its compressed data.
 
     `table` is where the part's table of offsets begins, `index` the number of the part in a file
@@ -163,9 +115,9 @@ def _blocks(
             f"incomplete: the file ends in the table of its {len(places)} blocks of pixels; "
             "render or copy it again"
         )
-    offsets = struct.unpack_from(f"<{len(places)}Q", data, table)
+    offsets = struct.unpack(f"<{len(places)}Q", data[table : table + 8 * len(places)])
+    largest = _largest_block(part)
     blocks = []
-    view = memoryview(data)  # a slice of it is no copy
     missing = 0
     for offset, place, new_place in zip(offsets, places, moved, strict=True):
         leader = place if index is None else struct.pack("<i", index) + place
@@ -175,13 +127,13 @@ def _blocks(
             continue
         if data[offset : begin - 4] != leader:
             raise damaged("its table of blocks of pixels does not lead to them")
-        (size,) = struct.unpack_from("<i", data, begin - 4)
-        if size <= 0:
+        (size,) = struct.unpack("<i", data[begin - 4 : begin])
+        if not 0 < size <= largest:
             raise damaged(f"a block of pixels has {size} bytes")
         if begin + size > len(data):
             missing += 1
             continue
-        blocks.append((new_place, view[begin : begin + size]))
+        blocks.append((new_place, data[begin : begin + size]))
     if missing:
         raise ImageError(
             f"incomplete: {missing} of {len(places)} blocks of pixels are missing or cut off; "
@@ -190,7 +142,20 @@ def _blocks(
     return blocks
 
 
-def _one_part(part: Part, blocks: list[tuple[bytes, memoryview]], long_names: bool) -> bytes:
+def _largest_block(part: Part) -> int:
+    """Bytes that a block may have: what does not become smaller is stored as it is.
+
+    Twice that and a bit, for compressions that keep tables of their own.
+    """
+    if part.tiled:
+        columns, rows, _ = value_of(part.attributes, "tiles", "<IIB")
+    else:
+        rows = _BLOCK_ROWS[value_of(part.attributes, "compression", "<B")[0]]
+        columns = part.size[0]
+    return 2 * columns * rows * sum(channel.bytes for channel in part.channels.values()) + 2**16
+
+
+def _one_part(part: Part, blocks: list[tuple[bytes, bytes]], long_names: bool) -> bytes:
     """An OpenEXR file of this part alone, its data window moved to the origin."""
     width, height = part.size
     window = struct.pack("<iiii", 0, 0, width - 1, height - 1)
@@ -214,7 +179,7 @@ def _one_part(part: Part, blocks: list[tuple[bytes, memoryview]], long_names: bo
     head += b"\0"
     at = len(head) + 8 * len(blocks)
     offsets: list[int] = []
-    body: list[bytes | memoryview] = []
+    body: list[bytes] = []
     for place, block in blocks:
         offsets.append(at)
         body += [place, struct.pack("<i", len(block)), block]
@@ -222,16 +187,18 @@ def _one_part(part: Part, blocks: list[tuple[bytes, memoryview]], long_names: bo
     return b"".join([head, struct.pack(f"<{len(offsets)}Q", *offsets), *body])
 
 
-def _decoded(data: bytes, names: tuple[str, ...]) -> list[Floats]:
+def _decoded(data: bytes) -> dict[str, Floats]:
     import OpenEXR
 
     try:
         parts = OpenEXR.File(io.BytesIO(data), separate_channels=True).parts
+    except MemoryError:
+        raise
     except Exception as error:
         raise damaged(f"the OpenEXR library refuses it ({error})") from error
     if not parts:  # it prints a warning and leaves out a part that it cannot read
         raise damaged("its blocks of pixels cannot be decompressed")
-    return [parts[0].channels[name].pixels.astype(np.float32) for name in names]
+    return {name: channel.pixels for name, channel in parts[0].channels.items()}
 
 
 def encode_exr(channels: Mapping[str, Floats]) -> bytes:

@@ -1,26 +1,26 @@
 """What the channels of an OpenEXR file mean: their colours, and where they lie."""
 
-from typing import TypeAlias
-
 import numpy as np
-from numpy.typing import NDArray
 
-from torch_vdm.io.exr_header import Part, damaged, listed, value_of
-from torch_vdm.io.refusal import Floats, ImageError, require_finite
-
-Matrix: TypeAlias = NDArray[np.float64]
-
-# x, y of red, green, blue and white. ITU-R BT.709-6, table 1.
-BT709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-# The "primaries" of a file whose R, G, B are CIE X, Y, Z; its white is a formality.
-XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
-# Chromaticities, or coefficients of a conversion, that differ by less are the same but for rounding
-# in the file (choice).
-SAME_COLOUR = 1e-3
-
-# Cone-like responses for chromatic adaptation, from CIE XYZ (Bradford). ICC.1:2010, annex E.3.
-BRADFORD = np.array(
-    [(0.8951, 0.2664, -0.1614), (-0.7502, 1.7135, 0.0367), (0.0389, -0.0685, 1.0296)]
+from torch_vdm.io import alpha
+from torch_vdm.io.exr_header import Part, listed, value_of
+from torch_vdm.io.exr_layers import Layer
+from torch_vdm.io.primaries import (
+    BT709,
+    SAME_COLOUR,
+    XYZ,
+    Matrix,
+    converted,
+    is_identity,
+    rgb_to_xyz,
+    to_bt709,
+)
+from torch_vdm.io.refusal import (
+    Floats,
+    ImageError,
+    Repair,
+    require_finite,
+    without_negatives,
 )
 
 # Half of the symmetric filter that makes the chroma between two samples; the first tap is for the
@@ -28,37 +28,74 @@ BRADFORD = np.array(
 CHROMA_TAPS = (0.627123, -0.186077, 0.087929, -0.043159, 0.019597, -0.007540, 0.002128)
 
 
+# The largest finite number of a channel's type: whole numbers are finite, half, float.
+LARGEST = (np.float32(2**32), np.float32(65504), np.finfo(np.float32).max)
+
+
 def colours(
-    part: Part, names: tuple[str, ...], planes: list[Floats], nonfinite: str, notes: list[str]
+    part: Part,
+    layer: Layer,
+    decoded: dict[str, Floats],
+    repair: Repair,
+    coded: bool,
+    notes: list[str],
 ) -> Floats:
-    """The channels `names` as linear BT.709 of the display window's size, shape (3, H, W)."""
-    model = tuple(name.rpartition(".")[2] for name in names)
-    steps = [part.channels[name].step for name in names]
+    """The layer as linear BT.709 of the display window's size, shape (3, H, W).
+
+    With ``coded`` the values are sRGB-coded, and stay so.
+    """
+    steps = [part.channels[name].step for name in layer.channels]
+    planes = [decoded[name].astype(np.float32) for name in layer.channels]
+    largest = _largest(part, layer.channels)
     x0, y0 = part.window[0] - part.display[0], part.window[1] - part.display[1]
-    if model == ("Y", "RY", "BY"):
+    if layer.model == ("Y", "RY", "BY"):
         if steps[0] != (1, 1) or steps[1] != steps[2] or steps[1] not in ((1, 1), (2, 2)):
             raise ImageError(f"expected chroma at half the resolution of Y, got sampling {steps}")
         # Before anything else, since a NaN would spread over the filter's width.
-        luminance = require_finite(planes[0][None], nonfinite, notes, (x0, y0))[0]
-        chroma = require_finite(np.stack(planes[1:]), nonfinite, notes, (x0, y0), steps[1][0])
-        weights = _rgb_to_xyz(_chromaticities(part))[1]
+        luminance = require_finite(
+            planes[0][None], repair.nonfinite, notes, (x0, y0), largest=largest[:1]
+        )[0]
+        chroma = require_finite(
+            np.stack(planes[1:]), repair.nonfinite, notes, (x0, y0), steps[1][0], largest[1:]
+        )
+        weights = rgb_to_xyz(_chromaticities(part))[1]
         image = _from_luminance_chroma(luminance, chroma, weights)
         notes.append("R, G, B are reconstructed from luminance and chroma (Y, RY, BY).")
-        image = _placed(image, part, notes)
+        image = require_finite(_placed(image, part, notes), repair.nonfinite, notes)
     else:
-        if any(step != (1, 1) for step in steps):
-            raise ImageError(
-                f"expected a value of {listed(list(names))} in every pixel, got {steps}"
-            )
-        image = require_finite(_placed(np.stack(planes), part, notes), nonfinite, notes)
-    if model == ("Y",):
+        image = _placed(np.stack(_whole(planes, steps, layer.channels)), part, notes)
+        image = require_finite(image, repair.nonfinite, notes, largest=largest)
+    # The file's own: conversion makes others, of colours that BT.709 lacks, and these are legal.
+    image = without_negatives(image, repair.negative, notes)
+    if layer.model == ("Y",):
         notes.append("The image is grey (channel Y): R = G = B.")
         image = np.broadcast_to(image, (3, *image.shape[1:]))
+    elif coded:
+        _require_bt709(part, layer)
     else:
-        image = _to_bt709(image, part, model == ("X", "Y", "Z"), notes)
+        image = _to_bt709(image, part, layer.model == ("X", "Y", "Z"), notes)
     _note_scale(part, notes)
     # Once more: what was finite in the file may overflow on the way.
-    return require_finite(image, nonfinite, notes)
+    return require_finite(image, repair.nonfinite, notes)
+
+
+def transparency(part: Part, name: str, decoded: dict[str, Floats], notes: list[str]) -> Floats:
+    """A channel of alpha, (H, W) of the display window's size."""
+    planes = _whole([decoded[name].astype(np.float32)], [part.channels[name].step], (name,))
+    return alpha.plane(_placed(np.stack(planes), part, [])[0], notes)
+
+
+def _whole(
+    planes: list[Floats], steps: list[tuple[int, int]], names: tuple[str, ...]
+) -> list[Floats]:
+    """The planes, which must have a value in every pixel."""
+    if any(step != (1, 1) for step in steps):
+        raise ImageError(f"expected a value of {listed(list(names))} in every pixel, got {steps}")
+    return planes
+
+
+def _largest(part: Part, names: tuple[str, ...]) -> Floats:
+    return np.array([LARGEST[part.channels[name].kind] for name in names], np.float32)
 
 
 def _from_luminance_chroma(luminance: Floats, chroma: Floats, weights: Matrix) -> Floats:
@@ -140,20 +177,6 @@ def _chromaticities(part: Part) -> tuple[float, ...]:
     return value_of(part.attributes, "chromaticities", "<8f")
 
 
-def _rgb_to_xyz(chromaticities: tuple[float, ...]) -> Matrix:
-    """The matrix that gives CIE XYZ, with Y = 1 for R = G = B = 1."""
-    xy = np.array(chromaticities, np.float64).reshape(4, 2)
-    xyz = np.column_stack((xy, 1 - xy.sum(1)))
-    primaries = xyz[:3].T
-    with np.errstate(all="ignore"):
-        # The determinant is twice the area of the triangle that the primaries make.
-        if np.isfinite(xy).all() and abs(np.linalg.det(primaries)) > 1e-6 and xy[3, 1] > 0:
-            matrix = primaries * np.linalg.solve(primaries, xyz[3] / xyz[3, 1])
-            if np.isfinite(matrix).all() and matrix[1, 1] > 0:
-                return matrix
-    raise damaged(f"its chromaticities {chromaticities} are no colour space")
-
-
 def _to_bt709(image: Floats, part: Part, is_xyz: bool, notes: list[str]) -> Floats:
     """Convert primaries, and the white by the Bradford transform.
 
@@ -164,34 +187,32 @@ def _to_bt709(image: Floats, part: Part, is_xyz: bool, notes: list[str]) -> Floa
         notes.append("No chromaticities are given: BT.709 is assumed, as the format prescribes.")
         return image
     given = XYZ if is_xyz else _chromaticities(part)
-    matrix = _rgb_to_xyz(given)
+    matrix = rgb_to_xyz(given)
     absolute = np.allclose(given, XYZ, rtol=0, atol=SAME_COLOUR)
     neutral = BT709[6:] if absolute else given[6:]
     if "adoptedNeutral" in part.attributes:
         neutral = value_of(part.attributes, "adoptedNeutral", "<ff")
-    to_bt709 = np.linalg.inv(_rgb_to_xyz(BT709)) @ _adaptation(neutral) @ matrix
-    if np.allclose(to_bt709, np.eye(3), rtol=0, atol=SAME_COLOUR):
+    conversion = to_bt709(matrix, neutral)
+    if is_identity(conversion):
         return image
     space = "CIE XYZ" if absolute else f"primaries {', '.join(f'{c:.4g}' for c in given[:6])}"
     notes.append(
         f"Colours are converted from {space} to BT.709, white from ({neutral[0]:.4g}, "
         f"{neutral[1]:.4g}) to D65."
     )
-    with np.errstate(over="ignore", invalid="ignore"):
-        converted: Floats = np.tensordot(to_bt709.astype(np.float32), image, 1)
-    return converted
+    return converted(image, conversion)
 
 
-def _adaptation(neutral: tuple[float, ...]) -> Matrix:
-    """The matrix, XYZ to XYZ, that takes the colour x, y = `neutral` to D65 (Bradford)."""
-    x, y = neutral
-    if not (0 < x < 1 and 0 < y < 1):
-        raise damaged(f"its white ({x:g}, {y:g}) is no colour")
-    responses = [BRADFORD @ (u / v, 1, (1 - u - v) / v) for u, v in ((x, y), (BT709[6], BT709[7]))]
-    if responses[0].min() <= 0:
-        raise damaged(f"its white ({x:g}, {y:g}) is no colour")
-    matrix: Matrix = np.linalg.inv(BRADFORD) @ np.diag(responses[1] / responses[0]) @ BRADFORD
-    return matrix
+def _require_bt709(part: Part, layer: Layer) -> None:
+    """Refuse what a conversion would be needed for that coded values do not allow."""
+    matrix = np.eye(3)
+    if "chromaticities" in part.attributes:
+        given = _chromaticities(part)
+        matrix = to_bt709(rgb_to_xyz(given), given[6:])
+    if layer.model != ("R", "G", "B") or not is_identity(matrix):
+        raise ImageError(
+            "expected sRGB-coded R, G, B in BT.709 (--coded), got other colours; leave out --coded"
+        )
 
 
 def _note_scale(part: Part, notes: list[str]) -> None:

@@ -2,11 +2,22 @@
 
 import struct
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 from torch_vdm.io.refusal import ImageError
 
 Window: TypeAlias = tuple[int, int, int, int]  # x min, y min, x max, y max; all inclusive
+
+
+class Bytes(Protocol):
+    """Bytes, or a file whose slices are read when they are asked for."""
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+
+    def __getitem__(self, part: slice, /) -> bytes:
+        """Return a part of them."""
+
 
 TILED, LONG_NAMES, _DEEP, _MULTIPART = 0x200, 0x400, 0x800, 0x1000
 
@@ -42,11 +53,11 @@ class Part:
         return self.window[2] - self.window[0] + 1, self.window[3] - self.window[1] + 1
 
 
-def read_headers(data: bytes) -> tuple[list[Part], int, bool]:
+def read_headers(data: Bytes) -> tuple[list[Part], int, bool]:
     """The parts, where the first table of offsets begins, and whether names may be long."""
     if len(data) < 8:
         raise damaged("the file ends in its header")
-    (field,) = struct.unpack_from("<I", data, 4)
+    (field,) = struct.unpack("<I", data[4:8])
     flags = field & ~0xFF
     if field & 0xFF != 2 or flags & ~(TILED | LONG_NAMES | _DEEP | _MULTIPART):
         raise ImageError(
@@ -65,7 +76,7 @@ def read_headers(data: bytes) -> tuple[list[Part], int, bool]:
     return parts, at, bool(flags & LONG_NAMES)
 
 
-def _attributes(data: bytes, at: int) -> tuple[dict[str, bytes], int]:
+def _attributes(data: Bytes, at: int) -> tuple[dict[str, bytes], int]:
     attributes: dict[str, bytes] = {}
     while True:
         name, at = _text(data, at)
@@ -74,7 +85,7 @@ def _attributes(data: bytes, at: int) -> tuple[dict[str, bytes], int]:
         _, at = _text(data, at)
         if at + 4 > len(data):
             raise damaged("the file ends in its header")
-        (size,) = struct.unpack_from("<i", data, at)
+        (size,) = struct.unpack("<i", data[at : at + 4])
         at += 4
         if not 0 <= size <= len(data) - at:
             raise damaged(f"the header's attribute {short(name)!r} goes beyond the end of the file")
@@ -82,12 +93,12 @@ def _attributes(data: bytes, at: int) -> tuple[dict[str, bytes], int]:
         at += size
 
 
-def _text(data: bytes, at: int) -> tuple[str, int]:
+def _text(data: Bytes, at: int) -> tuple[str, int]:
     """The string that begins at `at`, and where the next thing begins."""
-    end = data.find(b"\0", at, at + 256)
-    if end < 0:
+    name, zero, _ = data[at : at + 256].partition(b"\0")
+    if not zero:
         raise damaged("a name in the header does not end")
-    return data[at:end].decode("utf-8", "backslashreplace"), end + 1
+    return name.decode("utf-8", "backslashreplace"), at + len(name) + 1
 
 
 def value_of(attributes: dict[str, bytes], name: str, form: str) -> tuple[int, ...]:

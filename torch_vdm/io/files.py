@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import os
+import re
 import secrets
 import stat
 import sys
@@ -11,99 +12,200 @@ import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import BinaryIO, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torch_vdm.io.coded import encode_coded, load_jpeg, load_png
-from torch_vdm.io.exr import encode_exr, load_exr
-from torch_vdm.io.refusal import Floats, ImageError, printable, without_negatives
+from torch_vdm.io.alpha import colour, over
+from torch_vdm.io.decoded import Decoded, Kind
+from torch_vdm.io.exr import Choice, encode_exr, load_exr
+from torch_vdm.io.netpbm import load_pfm, load_pnm
+from torch_vdm.io.pictures import encode_coded, load_picture
+from torch_vdm.io.png import load_png
+from torch_vdm.io.radiance import load_hdr
+from torch_vdm.io.refusal import Floats, ImageError, Negative, Nonfinite, Repair, printable
+from torch_vdm.io.tiff import load_tiff
 
 PathLike: TypeAlias = str | os.PathLike[str]
 
-# Which suffixes are written, and what a file of that name is expected to hold.
+# Which suffixes are written.
 FORMATS = {".exr": "OpenEXR", ".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+
+# What a file of a name is expected to hold.
+SUFFIXES = FORMATS | {
+    ".hdr": "HDR",
+    ".pic": "HDR",
+    ".pfm": "PFM",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".webp": "WebP",
+    ".bmp": "BMP",
+    ".ppm": "PNM",
+    ".pgm": "PNM",
+    ".pbm": "PNM",
+    ".pnm": "PNM",
+    ".tga": "TGA",
+    ".gif": "GIF",
+    ".avif": "AVIF",
+    ".jxl": "JPEG XL",
+}
+
+# The first bytes of each; TGA has none.
+MAGIC = (
+    ("OpenEXR", rb"\x76\x2f\x31\x01"),
+    ("PNG", rb"\x89PNG\r\n\x1a\n"),
+    ("JPEG", rb"\xff\xd8\xff"),
+    ("HDR", rb"#\?"),
+    ("PFM", rb"P[Ff]\s"),
+    ("PNM", rb"P[1-6][\s#]"),
+    ("TIFF", rb"II[*+]\0|MM\0[*+]"),
+    ("WebP", rb"RIFF....WEBP"),
+    ("GIF", rb"GIF8[79]a"),
+    ("BMP", rb"BM"),
+    ("AVIF", rb"....ftypavi[fs]|....ftypmif1.{4,16}avif"),
+    ("JPEG XL", rb"\xff\x0a|\0\0\0\x0cJXL "),
+)
+
+# Those whose pixels are light, and those that may be: floating point in a TIFF.
+SCENE = ("OpenEXR", "HDR", "PFM")
+
+# The largest file that is read whole, bytes: all but OpenEXR, of which only what is wanted is read.
+# Twice what the largest image takes with 64 bits a channel. Status: choice.
+LARGEST_FILE = 2**32
+
+# The bytes that tell what a file is.
+HEAD = 64
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
     """An image and what was assumed to read it.
 
-    Parameters
+    Attributes
     ----------
     pixels
-        float32, shape (3, H, W).
-    linear
-        True: scene-linear BT.709, where 1.0 is what the scene calls white (OpenEXR).
-        False: sRGB-coded in [0, 1] (PNG, JPEG).
+        float32, shape (3, H, W), over the background where the file is transparent.
+    kind
+        What they are. "coded": sRGB-coded, 0 to 1; colours that sRGB lacks lie outside. "scene":
+        linear BT.709, where 1.0 is what the scene calls white. "absolute": linear BT.709 in cd/m2
+        (PQ, HLG).
     notes
         One sentence for every assumption and every repair, in the order in which they were made.
+    content
+        The format: "OpenEXR", "PNG" and so on.
+    alpha
+        float32, (H, W) in [0, 1]; None where the file has none.
+    associated
+        Whether the file's colours are multiplied by alpha.
+    views
+        The names of the views of a multi-view OpenEXR file, that of `pixels` among them.
     """
 
     pixels: Tensor
-    linear: bool
+    kind: Kind
     notes: tuple[str, ...]
+    content: str
+    alpha: Tensor | None = None
+    associated: bool = False
+    views: tuple[str, ...] = ()
+
+    @property
+    def linear(self) -> bool:
+        """Whether the pixels are light, not code."""
+        return self.kind != "coded"
 
 
 def read_image(
     path: PathLike,
     *,
     part: int | str | None = None,
-    nonfinite: Literal["raise", "zero"] = "raise",
-    negative: Literal["keep", "raise", "clip"] = "keep",
+    nonfinite: Nonfinite = "raise",
+    negative: Negative = "keep",
+    background: str = "black",
 ) -> Tensor:
-    """Read an OpenEXR, PNG or JPEG file: the pixels of `load`.
+    """Read an image file: the pixels of `load`.
 
     Negative linear values (colours out of gamut, lobes of filters) are kept unless asked otherwise;
     everything else is as in `load`.
 
     Returns
     -------
-    float32, shape (3, H, W): scene-linear BT.709 from OpenEXR, sRGB-coded in [0, 1] from PNG and
-    JPEG.
+    float32, shape (3, H, W). Scene-linear BT.709 from OpenEXR, Radiance .hdr, PFM and TIFF of
+    floating point. sRGB-coded from all else: in [0, 1], but for colours that sRGB lacks, of files
+    that say that they have such, which lie outside.
 
     Raises
     ------
     ImageError
-        As `load` does.
+        As `load` does; and where the pixels are none of both, or others than the file's name
+        promises: absolute light (PQ, HLG), an OpenEXR file called .png. `load` reads these.
     """
-    return load(path, part=part, nonfinite=nonfinite, negative=negative).pixels
+    image = load(path, part=part, nonfinite=nonfinite, negative=negative, background=background)
+    named = SUFFIXES.get(Path(path).suffix.lower(), image.content)
+    promised = image.content == "TIFF" or image.linear == (named in SCENE)
+    if image.kind == "absolute" or not promised:
+        raise ImageError(
+            f"{os.fspath(path)}: expected {'light' if named in SCENE else 'sRGB-coded values'} in "
+            f"a file of this name, got {image.content} of {image.kind} values; read it with "
+            "torch_vdm.io.load, which says what they are"
+        )
+    return image.pixels
 
 
 def load(
     path: PathLike,
     *,
     part: int | str | None = None,
-    nonfinite: Literal["raise", "zero"] = "raise",
-    negative: Literal["keep", "raise", "clip"] = "raise",
+    view: str | None = None,
+    channels: Mapping[str, str] | None = None,
+    nonfinite: Nonfinite = "raise",
+    negative: Negative = "raise",
+    background: str = "black",
+    coded: bool = False,
     quiet: bool = False,
 ) -> Image:
-    """Read an OpenEXR, PNG or JPEG file, and say what was assumed.
+    """Read an image file, and say what was assumed.
 
-    The content decides the format; the name is used in messages only.
+    The content decides the format; the name is used in messages, and where TGA is meant. What is
+    read of which format, and what is refused: docs/files.md.
 
-    OpenEXR: channels R, G, B, else Y, RY, BY (luminance and chroma), else X, Y, Z (CIE), else Y
-    (grey), else the first layer that has R, G, B; other channels, alpha among them, are left out.
-    Primaries other than BT.709's are converted. The image has the size of the display window. Of a
-    tiled file with several levels the full resolution is read. Deep files are refused.
+    OpenEXR: channels R, G, B (r, red, .R), else Y, RY, BY (luminance and chroma), else X, Y, Z
+    (CIE), else Y (grey), of no layer, else of one called Combined, beauty, rgba, color or colour,
+    else of the only layer there is. Primaries other than BT.709's are converted. The image has the
+    size of the display window. Of a tiled file with several levels the full resolution is read.
+    Deep files are refused.
 
-    PNG and JPEG: grey, palette and 16-bit files too; alpha is left out; a JPEG is turned the way
-    its EXIF data says; CMYK is refused.
+    Other formats: grey, palette and 16-bit files too. What a file says of its colours (cICP, ICC
+    profile, gAMA and cHRM) and of its orientation is followed. CMYK, animations and several
+    pictures in a file are refused.
 
     Parameters
     ----------
     path
         The file.
     part
-        Which part of an OpenEXR file: its index from 0, its name, or the name of a layer (the
-        channels ``name.R``, ``name.G``, ``name.B``). None: the first part that has R, G, B.
+        Which part of an OpenEXR file: its index from 0, its name, or the name of a layer, whole
+        (``ViewLayer.Combined``) or its last word. None: what looks like the picture.
+    view
+        Which view of a multi-view OpenEXR file. None: the first.
+    channels
+        The names of the OpenEXR channels to take for "R", "G", "B" and perhaps "A".
     nonfinite
-        What to do about NaN and infinity: refuse the file, or put 0 in their place.
+        What to do about NaN and infinity: refuse the file, put 0 in their place, or hold infinity
+        to the largest finite value of the channel's type (65504 for half) and NaN to the mean of
+        its finite neighbours, or 0.
     negative
-        What to do about negative linear values: keep them, refuse the file, or put 0 in their
-        place.
+        What to do about negative linear values that the file has: keep them, refuse the file, or
+        put 0 in their place. Those that come of a conversion to BT.709 are kept.
+    background
+        What is seen through a transparent image: black, white, grey or #rrggbb, sRGB-coded; white
+        is 1.0 of linear values and 203 cd/m2 of absolute ones. sRGB-coded values are composited as
+        they are, light as light; colours that are associated with alpha (OpenEXR, some TIFF) are
+        not multiplied by it again.
+    coded
+        Take values of light (OpenEXR, .hdr, PFM, TIFF of floating point) for sRGB-coded ones.
     quiet
         Keep the libraries from printing. The OpenEXR library writes to standard output and standard
         error by itself when the data inside a block is damaged. To hold that back, file descriptors
@@ -112,7 +214,7 @@ def load(
 
     Returns
     -------
-    The pixels, float32 of shape (3, H, W), whether they are linear, and the notes.
+    The pixels, float32 of shape (3, H, W), what they are, and the notes.
 
     Raises
     ------
@@ -120,19 +222,36 @@ def load(
         If the file is missing, damaged, incomplete, of another kind, too large (over
         89 million pixels) or without colour channels, or if its values are refused. The message
         is one line that names the file.
+    MemoryError
+        If it does not fit into memory; it names the file too.
     """
     for name, value, known in (
-        ("nonfinite", nonfinite, ("raise", "zero")),
+        ("nonfinite", nonfinite, ("raise", "zero", "clamp")),
         ("negative", negative, ("keep", "raise", "clip")),
     ):
         if value not in known:
             raise ValueError(f"expected {name} to be one of {known}, got {value!r}")
+    colour(background)  # refuses what is none
     try:
-        return _load(path, part, nonfinite, negative, quiet)
+        notes: list[str] = []
+        with _hushed() if quiet else contextlib.nullcontext():
+            choice = Choice(part, view, channels)
+            content, decoded = _decoded(path, choice, Repair(nonfinite, negative), coded, notes)
+        pixels = over(decoded, background, notes)
     except ImageError as error:
         raise ImageError(f"{os.fspath(path)}: {error}") from error.__cause__
     except MemoryError as error:
-        raise ImageError(f"{os.fspath(path)}: not enough memory to read it") from error
+        raise MemoryError(f"{printable(os.fspath(path))}: not enough memory to read it") from error
+    alpha = None if decoded.alpha is None else torch.from_numpy(np.array(decoded.alpha, np.float32))
+    return Image(
+        torch.from_numpy(np.array(pixels, np.float32, order="C")),
+        decoded.kind,
+        tuple(printable(note) for note in notes),
+        content,
+        alpha,
+        decoded.associated,
+        decoded.views,
+    )
 
 
 def write_image(path: PathLike, image: Tensor) -> None:
@@ -261,61 +380,105 @@ def check_target(target: Path) -> None:
         raise ImageError(f"{target}: expected a file to write to, got a folder or a device")
 
 
-def _load(
-    path: PathLike, part: int | str | None, nonfinite: str, negative: str, quiet: bool
-) -> Image:
-    notes: list[str] = []
-    data = _read(path)
-    content = _content(data, path, notes)
-    if content != "OpenEXR" and part not in (None, 0):
-        raise ImageError(f"expected an OpenEXR file for part {part!r}, got {content}")
-    with _hushed() if quiet else contextlib.nullcontext():
-        if content == "OpenEXR":
-            pixels = load_exr(data, part, nonfinite, notes)
-            pixels = without_negatives(pixels, negative, notes)
-        else:
-            pixels = load_png(data, notes) if content == "PNG" else load_jpeg(data, notes)
-    sentences = tuple(printable(note) for note in notes)
-    return Image(
-        torch.from_numpy(np.array(pixels, np.float32, order="C")), content == "OpenEXR", sentences
-    )
+class _Slices:
+    """A file of which parts are read when they are asked for."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self._file, self._size = file, size
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, part: slice, /) -> bytes:
+        begin, end, _ = part.indices(self._size)
+        self._file.seek(begin)
+        data = self._file.read(max(0, end - begin))
+        if len(data) < end - begin:
+            raise ImageError("incomplete: the file became shorter while it was read; wait for it")
+        return data
 
 
-def _read(path: PathLike) -> bytes:
+def _decoded(
+    path: PathLike, choice: Choice, repair: Repair, coded: bool, notes: list[str]
+) -> tuple[str, Decoded]:
+    """The format, and the image. No more of a file is read than is needed."""
+    try:
+        with _opened(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            content = _content(file.read(HEAD), path, notes)
+            if content == "OpenEXR":
+                return content, load_exr(_Slices(file, size), choice, repair, coded, notes)
+            if choice.part not in (None, 0) or choice.view or choice.channels:
+                wanted = f"part {choice.part!r}" if choice.part else "views and channels"
+                raise ImageError(f"expected an OpenEXR file for {wanted}, got {content}")
+            if size > LARGEST_FILE:
+                raise ImageError(
+                    f"expected a file of at most {LARGEST_FILE} bytes, got {size}; make it smaller"
+                )
+            file.seek(0)
+            data = file.read()
+    except OSError as error:
+        raise ImageError(f"cannot be read: {error.strerror or error}") from error
+    return content, _decoded_whole(data, content, repair, coded, notes)
+
+
+def _decoded_whole(
+    data: bytes, content: str, repair: Repair, coded: bool, notes: list[str]
+) -> Decoded:
+    if content == "PNG":
+        return load_png(data, notes)
+    if content == "TIFF":
+        return load_tiff(data, repair, coded, notes)
+    if content == "PNM":
+        return load_pnm(data, notes)
+    if content == "PFM":
+        image = load_pfm(data, repair, notes)
+        return image._replace(kind="coded") if coded else image
+    if content == "HDR":
+        image = load_hdr(data, repair.nonfinite, notes)
+        return image._replace(kind="coded") if coded else image
+    if content == "JPEG XL":
+        # The libraries for Python tell neither how many pictures there are nor their colours.
+        raise ImageError(
+            "expected another format, got JPEG XL; convert it to PNG with libjxl's djxl"
+        )
+    return load_picture(data, content, notes)
+
+
+@contextlib.contextmanager
+def _opened(path: PathLike) -> Iterator[BinaryIO]:
     file = Path(path)
     try:
         # Asked first, since opening a pipe that nobody writes to would wait for ever.
-        kind = file.stat().st_mode
-        data = file.read_bytes() if stat.S_ISREG(kind) else None
+        status = file.stat()
     except FileNotFoundError as error:
         raise ImageError("no such file; check the name") from error
-    except OSError as error:
-        raise ImageError(f"cannot be read: {error.strerror or error}") from error
     except ValueError as error:  # a zero byte in the name
         raise ImageError(f"cannot be read: {error}") from error
-    if data is None:
-        what = "a folder" if stat.S_ISDIR(kind) else "a device or a pipe; copy it to a file first"
+    if not stat.S_ISREG(status.st_mode):
+        folder = stat.S_ISDIR(status.st_mode)
+        what = "a folder" if folder else "a device or a pipe; copy it to a file first"
         raise ImageError(f"expected an image file, got {what}")
-    if not data:
+    if not status.st_size:
         raise ImageError("expected an image, got an empty file; write it again")
-    return data
+    with file.open("rb") as stream:
+        yield stream
 
 
-def _content(data: bytes, path: PathLike, notes: list[str]) -> str:
-    """The format by the first bytes: "OpenEXR", "PNG" or "JPEG"."""
-    named = FORMATS.get(Path(path).suffix.lower())
-    for content, magic in (
-        ("OpenEXR", b"\x76\x2f\x31\x01"),
-        ("PNG", b"\x89PNG\r\n\x1a\n"),
-        ("JPEG", b"\xff\xd8\xff"),
-    ):
-        if data.startswith(magic):
+def _content(head: bytes, path: PathLike, notes: list[str]) -> str:
+    """The format by the first bytes: one of SUFFIXES' values."""
+    named = SUFFIXES.get(Path(path).suffix.lower())
+    for content, magic in MAGIC:
+        if re.match(magic, head, re.DOTALL):
             if named not in (None, content):
                 notes.append(f"The name says {named}, but the content is {content} and is read so.")
             return content
+    if named == "TGA":
+        return named
+    known = ", ".join(dict.fromkeys(SUFFIXES.values()))
     raise ImageError(
-        f"expected an OpenEXR, PNG or JPEG image, got other content (it begins with bytes "
-        f"{data[:4].hex(' ')}); {'export it again' if named else 'convert it to one of them'}"
+        f"expected an image ({known}), got other content (it begins with bytes "
+        f"{head[:4].hex(' ')}); {'export it again' if named else 'convert it to one of them'}"
     )
 
 
