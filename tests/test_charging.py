@@ -136,6 +136,7 @@ def test_nor_in_tiles(transform: Transform, tile: int) -> None:
         check(metric_of(transform).tiled(test, reference, tile), change, transform)
 
 
+@pytest.mark.filterwarnings("ignore:expected sRGB-coded values:UserWarning")
 @pytest.mark.parametrize("transform", [Haar(), StationaryHaar("filter")], ids=repr)
 def test_nor_by_the_compiled_route(transform: Transform) -> None:
     # Of one dtype and with the options of other tests: each function is compiled once for all.

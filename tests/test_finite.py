@@ -13,6 +13,9 @@ from torch_vdm.cortex import Transform
 EFFECTS = [Effects(*switches) for switches in itertools.product((True, False), repeat=4)]
 DISPLAYS = [Display.srgb(), Display.linear(1e4, exposure=-3.0), Display.xyz()]
 
+# Images here are numbers that need be no pictures.
+pytestmark = pytest.mark.filterwarnings("ignore:expected sRGB-coded values:UserWarning")
+
 values = st.floats(allow_nan=False, allow_infinity=False, width=32)
 
 

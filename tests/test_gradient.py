@@ -6,6 +6,9 @@ from torch import Tensor
 
 from torch_vdm import VDM, Display, Effects, VDMLoss, vdm
 
+# Images here are numbers that need be no pictures.
+pytestmark = pytest.mark.filterwarnings("ignore:expected sRGB-coded values:UserWarning")
+
 
 @pytest.fixture(autouse=True)
 def level_by_level(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -201,6 +201,25 @@ def test_derivatives_of_every_transform_are_those_of_the_formula(
     assert torch.autograd.gradgradcheck(lambda image: loss(image, reference), test)
 
 
+@pytest.mark.parametrize("transform", [Haar(), StationaryHaar("filter")], ids=repr)
+def test_the_observer_has_a_name_of_its_own(transform: Transform) -> None:
+    observer = VDMLoss(transform=transform).metric.observer
+    fitted = Observer.calibrated().fitted_to(transform)
+    assert observer.name == "lit room"
+    assert observer == dataclasses.replace(fitted, name="lit room", dark_light=DARK_LIGHT)
+
+
+def test_a_wrong_mask_gives_nan_where_nothing_is_read_back() -> None:
+    test, reference = images()
+    mask = torch.ones(3, 1, 13, 18)
+    mask[1, 0, 2, 3] = -1.0
+    loss = VDMLoss(nonfinite="mask", reduction="none")
+    assert loss(test, reference, mask).isnan().tolist() == [False, True, False]
+    for wrong in (np.ones((3, 1, 13, 18)), 1.0):
+        with pytest.raises(ValueError, match=r"mask of shape \(3, 1, 13, 18\), got"):
+            loss(test, reference, wrong)
+
+
 def test_mask_values_are_checked() -> None:
     test, reference = images()
     mask = torch.ones(3, 1, 13, 18)

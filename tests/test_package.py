@@ -9,7 +9,8 @@ from benchmarks.places import ROOT
 
 
 def test_heavy_packages_are_imported_where_they_are_used() -> None:
-    heavy = "kornia", "matplotlib", "OpenEXR", "PIL", "rich", "tifffile", "torch._dynamo"
+    heavy = ("kornia", "matplotlib", "OpenEXR", "PIL", "rich", "tifffile", "torchmetrics")
+    heavy += ("torch._dynamo",)
     code = f"import sys, torch_vdm; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     assert done.stdout.decode().strip() == "[]"
@@ -22,3 +23,12 @@ def test_the_version_is_the_distributions() -> None:
 
 def test_public_names_exist() -> None:
     assert all(hasattr(torch_vdm, name) for name in torch_vdm.__all__)
+
+
+def test_modules_that_the_readme_names_come_with_the_package() -> None:
+    code = (
+        "import sys, torch_vdm; torch_vdm.functional.visual_difference; "
+        "assert 'torchmetrics' not in sys.modules; torch_vdm.metrics.VisualDifference"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert not hasattr(torch_vdm, "metric")

@@ -1,10 +1,10 @@
 """The whole metric, end to end, against the NumPy reference; and as a module."""
 
-import copy
 import dataclasses
-import io
 import itertools
 import pickle
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +13,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+import torch_vdm
 from tests.conftest import KINDS, make_xyz, reference_numbers
 from tests.ladder import TRANSFORMS
 from tests.reference import calibrated, paper
-from torch_vdm import VDM, Display, Effects, Observer, vdm
-from torch_vdm.cortex import Haar, Transform
+from torch_vdm import (
+    VDM,
+    Display,
+    Effects,
+    Haar,
+    Observer,
+    VDMLoss,
+    vdm,
+)
+from torch_vdm.cortex import Transform
+from torch_vdm.functional import visual_difference
 from torch_vdm.quadtree import apart, stacked
 
 PPD = 48.0
@@ -115,34 +125,6 @@ def images(batch: int = 2, height: int = 21, width: int = 34) -> tuple[torch.Ten
     reference = torch.rand(batch, 3, height, width, generator=generator)
     noise = 0.05 * torch.randn(reference.shape, generator=generator)
     return (reference + noise).clamp(0.0, 1.0), reference
-
-
-@pytest.mark.parametrize("name", ["deepcopy", "pickle", "state_dict"])
-def test_copies_answer_the_same(name: str) -> None:
-    metric, pair = VDM.paper(30.0), images()
-    match name:
-        case "deepcopy":
-            twin = copy.deepcopy(metric)
-        case "pickle":
-            twin = pickle.loads(pickle.dumps(metric))
-        case _:
-            twin = VDM(60.0, observer=dataclasses.replace(Observer.paper(), red_green_gain=1.0))
-            buffer = io.BytesIO()
-            torch.save(metric.state_dict(), buffer)
-            buffer.seek(0)
-            twin.load_state_dict(torch.load(buffer))
-    assert torch.equal(twin(*pair), metric(*pair))
-
-
-def test_constants_keep_their_precision() -> None:
-    metric, pair = VDM(), images()
-    expected = metric(*pair)
-    assert torch.equal(metric.half().to(torch.bfloat16)(*pair), expected)
-    assert {value.dtype for value in metric.buffers()} == {torch.float64}
-
-
-def test_moves_to_another_device() -> None:
-    assert {value.device.type for value in VDM().to("meta").buffers()} == {"meta"}
 
 
 def test_full_graph_compiles() -> None:
@@ -261,6 +243,10 @@ def test_half_precision_input_is_computed_in_float32(dtype: torch.dtype) -> None
     assert torch.equal(metric(test, reference), expected)
     with torch.autocast("cpu", torch.bfloat16):
         assert torch.equal(metric(test, reference), expected)
+        half, single = metric.represent(test), metric.represent(test.float())
+        assert half.mean.dtype == torch.float32
+        for one, other in zip(half.details, single.details, strict=True):
+            assert torch.equal(one, other)
 
 
 @pytest.mark.parametrize(
@@ -352,3 +338,148 @@ def test_gradients_are_finite_where_images_are_equal_or_black() -> None:
             assert not test.grad.any()
             metric(test, images(1, 9, 12)[0]).sum().backward()
             assert torch.isfinite(test.grad).all()
+
+
+# The package without its types.
+untyped: Any = torch_vdm
+
+
+class Named:
+    """An image of another library."""
+
+    shape = (1, 3, 4, 4)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((1, 3, 4, 4), np.float32), "that is a tensor .*got ndarray; torch.from_numpy"),
+        ([[0.0]], "that is a tensor .*got list"),
+        (Named(), "that is a tensor .*got Named"),
+        (torch.zeros(3, 4, 5), r"got \(3, 4, 5\); give it a batch of one, image\[None\]"),
+        (torch.zeros(2, 1, 4, 5), r"grey image, image.expand\(-1, 3, -1, -1\)"),
+        (torch.zeros(4, 5), r"grey image .*image.expand\(1, 3, -1, -1\)"),
+        (torch.zeros(1, 4, 5), r"grey image .*image.expand\(1, 3, -1, -1\)"),
+        (torch.zeros(2, 4, 4, 5), r"leave out alpha, image\[:, :3\]"),
+        (torch.zeros(2, 4, 5, 3), r"channels first, image.movedim\(-1, -3\)"),
+        (torch.zeros(4, 5, 3), r"channels first, image.movedim\(-1, -3\)"),
+        (torch.zeros(1, 3, 4, 5, dtype=torch.uint8), "uint8; divide 8-bit values by 255"),
+        (torch.zeros(1, 3, 4, 5, dtype=torch.int32), "int32; divide"),
+        (torch.zeros(1, 3, 4, 5, dtype=torch.complex64), "floating point, got torch.complex64"),
+        (torch.zeros(1, 3, 4, 5, device="meta"), "where the metric is, on cpu, got one on meta"),
+    ],
+)
+def test_what_is_no_image_is_told_what_to_do(image: object, message: str) -> None:
+    metric, loss = VDM(), VDMLoss()
+    calls: list[Callable[[Any], object]] = [
+        lambda image: metric(image, image),
+        lambda image: metric.power(image, image),
+        lambda image: metric.score(image, image),
+        lambda image: loss(image, image),
+        metric.represent,
+        lambda image: VDM.sarnoff()(image, image),
+        lambda image: visual_difference(image, image),
+    ]
+    for call in calls[: 6 if getattr(image, "is_meta", False) else 7]:
+        with pytest.raises(ValueError, match=message) as told:
+            call(image)
+        assert "\n" not in str(told.value)
+
+
+def test_images_of_two_devices_are_refused() -> None:
+    test, reference = images()
+    with pytest.raises(ValueError, match="expected a reference where the metric is"):
+        VDM()(test, reference.to("meta"))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: untyped.VDM(ppd="60"), "pixels per degree: a number, got '60'"),
+        (lambda: untyped.VDM(ppd=None), "pixels per degree: a number, got None"),
+        (lambda: untyped.VDM(ppd=True), "pixels per degree: a number, got True"),
+        (lambda: untyped.VDM(display="srgb"), "display: Display, got 'srgb'"),
+        (
+            lambda: untyped.VDM(transform=untyped.Haar),
+            r"transform: Haar\(\), StationaryHaar\(\) or Steerable\(\)",
+        ),
+        (lambda: untyped.VDM(transform="haar"), r"transform: Haar\(\).*, got 'haar'"),
+        (lambda: untyped.VDM(transform=untyped.Observer.paper()), r"transform: Haar\(\)"),
+        (lambda: untyped.VDM(observer=untyped.Observer.paper), "observer: Observer"),
+        (lambda: untyped.VDM(effects={"masking": False}), "effects: Effects"),
+        (lambda: untyped.VDM(nonfinite=["mask"]), 'nonfinite "raise" or "mask"'),
+        (lambda: untyped.VDM.sarnoff("60"), "pixels per degree: a number"),
+        (lambda: untyped.VDM.sarnoff(resample="no"), "resample: True or False, got 'no'"),
+        (lambda: untyped.VDMLoss(transform=untyped.Haar), r"transform: Haar\(\)"),
+        (lambda: untyped.VDMLoss(l1="1"), "l1: a number, got '1'"),
+        (lambda: untyped.VDMLoss(l1=None), "l1: a number"),
+        (lambda: untyped.VDMLoss(reduction=["mean"]), "reduction .*got"),
+        (lambda: untyped.VDMLoss(checkpoint="no"), "checkpoint: True or False, got 'no'"),
+        (lambda: untyped.Display("PQ", 100), 'encoding "srgb", "linear" or "xyz", got \'PQ\''),
+        (lambda: untyped.Display(None, 100), "encoding"),
+        (lambda: untyped.Display("srgb", "100"), "white: a number, got '100'"),
+        (lambda: untyped.Display.srgb(None), "white: a number"),
+        (lambda: untyped.Display.linear(100.0, "1"), "exposure: a number"),
+        (lambda: untyped.Display("xyz", 100.0), "white of 1.0 and no exposure for XYZ"),
+        (lambda: untyped.Display("xyz", 1.0, 2.0), "white of 1.0 and no exposure for XYZ"),
+        (lambda: untyped.Effects(masking="off"), "masking: True or False, got 'off'"),
+        (lambda: untyped.Effects(1), "aberration: True or False, got 1"),
+        (lambda: untyped.Haar(csf="filters"), 'csf "levels" or "filter"'),
+        (lambda: untyped.StationaryHaar(csf=1), 'csf "levels" or "filter"'),
+        (
+            lambda: untyped.pixels_per_degree(3840, 27, 0.6),
+            r"resolution \(width, height\), got 3840",
+        ),
+        (lambda: untyped.pixels_per_degree((3840,), 27, 0.6), r"resolution \(width, height\)"),
+        (lambda: untyped.pixels_per_degree(("a", 1), 27, 0.6), "a number, got 'a'"),
+        (lambda: untyped.pixels_per_degree((3840, 2160), "27", 0.6), "a number, got '27'"),
+        (
+            lambda: untyped.functional.visual_difference(*images(), ppd="60"),
+            "pixels per degree: a number",
+        ),
+        (
+            lambda: untyped.functional.visual_difference(*images(), transform=[]),
+            r"transform: Haar\(\)",
+        ),
+    ],
+)
+def test_every_wrong_option_is_a_value_error(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as told:
+        make()
+    assert "\n" not in str(told.value)
+
+
+def test_an_observer_takes_numbers_of_numpy_and_torch() -> None:
+    plain = Observer.calibrated()
+    changed = {"achromatic_gain": 300.0, "dim_luminance": 20.0, "band_width": 1.5}
+    expected = dataclasses.replace(plain, **changed)  # type: ignore[arg-type]  # numbers all
+    for kind in (np.float64, np.float32, np.int64, torch.tensor):
+        if kind is np.int64:
+            changed["band_width"] = 1.0
+            expected = dataclasses.replace(expected, band_width=1.0)
+        others = {name: kind(value) for name, value in changed.items()}
+        observer = dataclasses.replace(plain, **others)  # type: ignore[arg-type]  # numbers all
+        assert observer == expected
+        assert observer.numbers() == expected.numbers()
+        assert torch.equal(VDM(observer=observer)(*images()), VDM(observer=expected)(*images()))
+    gains = dataclasses.replace(plain, lowpass_gains=np.float32(plain.lowpass_gains).tolist())  # type: ignore[arg-type]  # a list
+    assert gains == plain
+
+
+@pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(Observer)])
+def test_every_field_of_an_observer_is_checked(name: str) -> None:
+    wrong = 1.0 if name == "name" else "wrong"
+    with pytest.raises(ValueError, match=f"expected {name}: "):
+        dataclasses.replace(Observer.calibrated(), **{name: wrong})  # type: ignore[arg-type]  # wrong on purpose
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_onnx_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    message = "expected no export to ONNX, .*use torch.export.export"
+    with pytest.raises(ValueError, match=message):
+        torch.onnx.export(VDM(), images(), dynamo=False)
+    # As the newer exporter says it, which needs packages of its own.
+    monkeypatch.setattr("torch.onnx.is_in_onnx_export", lambda: True)
+    with pytest.raises(ValueError, match=message):
+        torch.export.export(VDM(), images(), strict=False)

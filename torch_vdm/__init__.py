@@ -1,5 +1,9 @@
 """The JND meter for images that are computed: a visual difference metric in PyTorch."""
 
+from importlib import import_module
+from typing import Any
+
+from torch_vdm import functional
 from torch_vdm.cortex import Haar, StationaryHaar, Steerable
 from torch_vdm.display import Display, pixels_per_degree
 from torch_vdm.effects import Effects
@@ -20,7 +24,15 @@ __all__ = [
     "StationaryHaar",
     "Steerable",
     "VDMLoss",
+    "functional",
     "pixels_per_degree",
     "read_image",
     "write_image",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import `torch_vdm.metrics` where it is asked for: torchmetrics is optional, and large."""
+    if name == "metrics":
+        return import_module("torch_vdm.metrics")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,13 +1,17 @@
 """From pixel values to light: what the screen shows, and how large a pixel looks."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Literal, Self, get_args
 
 import torch
 from torch import Tensor
 
 from torch_vdm.matrix import mix
+from torch_vdm.options import choice, number
+
+Encoding = Literal["srgb", "linear", "xyz"]
 
 # Linear BT.709 to CIE XYZ, D65 white of Y = 1. Source: IEC 61966-2-1:1999. Status: source.
 BT709_TO_XYZ = (
@@ -45,12 +49,20 @@ class Display:
         Stops; the light is multiplied by 2^exposure.
     """
 
-    encoding: Literal["srgb", "linear", "xyz"]
+    encoding: Encoding
     white: float
     exposure: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse numbers that are no light."""
+        """Refuse what is no display."""
+        choice("an encoding", self.encoding, get_args(Encoding))
+        for name in ("white", "exposure"):
+            object.__setattr__(self, name, number(name, getattr(self, name)))
+        if self.encoding == "xyz" and (self.white, self.exposure) != (1.0, 0.0):
+            raise ValueError(
+                "expected a white of 1.0 and no exposure for XYZ, which is absolute, "
+                f"got {self.white} and {self.exposure}"
+            )
         if not (math.isfinite(self.white) and self.white > 0.0):
             raise ValueError(f"expected a luminance of white over 0 cd/m2, got {self.white}")
         if not (math.isfinite(self.exposure) and abs(self.exposure) <= 64.0):
@@ -166,11 +178,17 @@ def pixels_per_degree(
     ValueError
         Where a number is not positive and finite.
     """
-    numbers = (*resolution, diagonal_inches, distance_metres)
-    if not all(math.isfinite(number) and number > 0 for number in numbers):
+    if not (isinstance(resolution, Sequence) and len(resolution) == 2):
+        raise ValueError(f"expected a resolution (width, height), got {resolution!r}")
+    numbers = [
+        number("resolution, diagonal and distance", value)
+        for value in (*resolution, diagonal_inches, distance_metres)
+    ]
+    if not all(math.isfinite(value) and value > 0 for value in numbers):
         raise ValueError(
             "expected a positive resolution, diagonal (inches) and distance (metres), "
             f"got {resolution}, {diagonal_inches}, {distance_metres}"
         )
-    pixel_metres = diagonal_inches * 0.0254 / math.hypot(*resolution)
-    return 2.0 * distance_metres * math.tan(math.radians(0.5)) / pixel_metres
+    width, height, diagonal, distance = numbers
+    pixel_metres = diagonal * 0.0254 / math.hypot(width, height)
+    return 2.0 * distance * math.tan(math.radians(0.5)) / pixel_metres

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, fields
 
+from torch_vdm.options import switch
+
 
 @dataclass(frozen=True)
 class Effects:
@@ -23,6 +25,11 @@ class Effects:
     chromatic: bool = True
     masking: bool = True
     pooling: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse what is no switch."""
+        for field in fields(self):
+            switch(field.name, getattr(self, field.name))
 
     def names(self) -> list[str]:
         """Return the names of the effects that are on."""

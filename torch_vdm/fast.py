@@ -3,8 +3,10 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from threading import Lock
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,6 +25,37 @@ KEPT = 0.3
 
 # Whether `for_any_size` is in force: to ask the compiler's settings takes longer.
 _is_set: ContextVar[bool] = ContextVar("_is_set", default=False)
+
+
+class _Settings(NamedTuple):
+    """Those of the compiler that are changed."""
+
+    use_duck_shape: bool
+    recompile_limit: int
+    activation_memory_budget: float
+
+    def for_any_size(self) -> "_Settings":
+        return _Settings(
+            # Else two sides that are equal in the first image would be held equal for ever, and the
+            # first image that is not square would compile everything again.
+            use_duck_shape=False,
+            # For every mix of precision, gradients, display, observer and effects in one process.
+            recompile_limit=max(MOST_FORMS, self.recompile_limit),
+            activation_memory_budget=min(KEPT, self.activation_memory_budget),
+        )
+
+
+@dataclass(eq=False)
+class _Change:
+    """A change of settings that is in force, and for how many calls."""
+
+    before: _Settings
+    to: _Settings
+    calls: int = 0
+
+
+_lock = Lock()
+_changes: list[_Change] = []
 
 
 @cache
@@ -72,19 +105,34 @@ def for_any_size() -> Iterator[None]:
     from torch._functorch import config as gradients
     from torch.fx.experimental import _config as shapes
 
-    before = shapes.use_duck_shape, dynamo.recompile_limit, gradients.activation_memory_budget
-    # Else two sides that are equal in the first image would be held equal for ever, and the first
-    # image that is not square would compile everything again.
-    shapes.use_duck_shape = False
-    # For every mix of precision, gradients, display, observer and effects in one process.
-    dynamo.recompile_limit = max(MOST_FORMS, dynamo.recompile_limit)
-    gradients.activation_memory_budget = min(KEPT, gradients.activation_memory_budget)
+    def now() -> _Settings:
+        return _Settings(
+            shapes.use_duck_shape, dynamo.recompile_limit, gradients.activation_memory_budget
+        )
+
+    def set_to(settings: _Settings) -> None:
+        shapes.use_duck_shape, dynamo.recompile_limit, gradients.activation_memory_budget = settings
+
+    with _lock:
+        before = now()
+        # Where settings are the process's, and not each thread's, another thread may have changed
+        # them already: then the last that is done sets them back.
+        change = next((change for change in _changes if change.to == before), None)
+        if change is None:
+            change = _Change(before, before.for_any_size())
+            _changes.append(change)
+            set_to(change.to)
+        change.calls += 1
     token = _is_set.set(True)
     try:
         yield
     finally:
         _is_set.reset(token)
-        shapes.use_duck_shape, dynamo.recompile_limit, gradients.activation_memory_budget = before
+        with _lock:
+            change.calls -= 1
+            if change.calls == 0:
+                _changes.remove(change)
+                set_to(change.before)
 
 
 def step(function: Callable[..., Any], plane: Tensor, fast: bool) -> Callable[..., Any]:

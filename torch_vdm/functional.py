@@ -1,5 +1,6 @@
 """The metric and the loss as functions; the modules behind them are made once and kept."""
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -30,7 +31,7 @@ def visual_difference(test: Tensor, reference: Tensor, ppd: float = 60.0, **opti
     ValueError
         Where an option or an image is not as stated.
     """
-    seen: Tensor = _module(VDM, test.device, float(ppd), **options)(test, reference)
+    seen: Tensor = _module(VDM, test, ppd, options)(test, reference)
     return seen
 
 
@@ -62,10 +63,18 @@ def visual_difference_loss(
     ValueError
         Where an option or an image is not as stated.
     """
-    loss: Tensor = _module(VDMLoss, test.device, float(ppd), **options)(test, reference, mask)
+    loss: Tensor = _module(VDMLoss, test, ppd, options)(test, reference, mask)
     return loss
 
 
+def _module(kind: Callable[..., Any], image: Tensor, ppd: float, options: dict[str, Any]) -> Any:
+    device = image.device if isinstance(image, Tensor) else torch.device("cpu")
+    try:
+        return _kept(kind, device, ppd, **options)
+    except TypeError:  # an option that cannot be a key: the module says what is wrong with it
+        return kind(ppd, **options).to(device)
+
+
 @lru_cache(MOST_KEPT)
-def _module(kind: type[VDM | VDMLoss], device: torch.device, ppd: float, **options: Any) -> Any:
+def _kept(kind: Callable[..., Any], device: torch.device, ppd: float, **options: Any) -> Any:
     return kind(ppd, **options).to(device)

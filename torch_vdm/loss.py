@@ -2,16 +2,17 @@
 
 import math
 from dataclasses import replace
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 import torch
 from torch import Tensor, nn
 
 from torch_vdm import operators
+from torch_vdm.cortex import Haar
 from torch_vdm.display import Display
 from torch_vdm.distance import just_noticeable
 from torch_vdm.observer import Observer
-from torch_vdm.pair import has_values
+from torch_vdm.options import choice, number, switch
 from torch_vdm.vdm import VDM
 
 Reduction = Literal["mean", "sum", "none"]
@@ -44,13 +45,15 @@ class VDMLoss(nn.Module):
     white, for a display that takes light). It recovers what nobody sees, such as detail beyond the
     eye's resolution, and finds the way where the metric alone has local minima.
 
-    Finite with a finite gradient for every finite image.
+    Finite with a finite gradient for every finite image. A gradient that a half-precision image
+    cannot hold reaches it as infinity, by which `torch.amp.GradScaler` lowers its scale.
 
     Parameters
     ----------
     ppd, display, options
         As in `VDM`, but that the default observer is the calibrated one in a lit room, with a
-        hundred times its dark light: else a step away from black would be seen at any contrast.
+        hundred times its dark light, and called "lit room": else a step away from black would be
+        seen at any contrast.
     l1
         Weight of the L1 term; 0: the metric alone.
     reduction
@@ -75,14 +78,18 @@ class VDMLoss(nn.Module):
         **options: Any,
     ) -> None:
         super().__init__()
-        if reduction not in ("mean", "sum", "none"):
-            raise ValueError(f'expected reduction "mean", "sum" or "none", got {reduction!r}')
+        choice("reduction", reduction, get_args(Reduction))
+        l1 = number("l1", l1)
         if not (math.isfinite(l1) and l1 >= 0.0):
             raise ValueError(f"expected a weight l1 of 0 or more, got {l1}")
         if options.get("observer") is None:
-            options["observer"] = replace(Observer.calibrated(), dark_light=DARK_LIGHT)
+            # Fitted before it has a name of its own.
+            observer = Observer.calibrated().fitted_to(options.get("transform") or Haar())
+            options["observer"] = replace(observer, name="lit room", dark_light=DARK_LIGHT)
         self.metric = VDM(ppd, display, **options)
-        self.metric._checkpointed = bool(checkpoint)
+        # An image that is not trained yet may have any values: its target has not.
+        self.metric._out_of_range_in = all
+        self.metric._checkpointed = switch("checkpoint", checkpoint)
         self.l1 = l1
         self.reduction = reduction
         self._number = operators.enrol(self)
@@ -91,7 +98,9 @@ class VDMLoss(nn.Module):
         """Return the loss of (B, 3, H, W) against (B, 3, H, W).
 
         ``mask`` (B, 1, H, W) weights the pixels, 0 to leave one out; a pixel that is left out
-        still is what its neighbours are seen against.
+        still is what its neighbours are seen against. A weight that is not finite or below 0 is a
+        ValueError, for which one number is read back from the device; with ``nonfinite="mask"`` or
+        in a graph of torch.export nothing is, and the loss is NaN.
         """
         if operators.is_wanted() and not (mask is not None and mask.requires_grad):
             items = operators.loss_of_items(test, reference, mask, self._number)
@@ -109,7 +118,7 @@ class VDMLoss(nn.Module):
         power = self.metric._power(test, reference, seen)
         exponent = self.metric.observer.summation_exponent / EXPONENT
         plane = torch.log1p(just_noticeable(power, power.new_tensor(exponent))) + l1
-        return _mean(plane, mask)
+        return plane.mean((1, 2, 3)) if mask is None else self._weighted(plane, mask)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the state of another, of which this is a copy."""
@@ -127,21 +136,16 @@ class VDMLoss(nn.Module):
         difference = display.to_code(test) - display.to_code(reference)
         return difference.abs().mean(1, keepdim=True)
 
-
-def _mean(plane: Tensor, mask: Tensor | None) -> Tensor:
-    """Return the mean of every item, (B,), weighted where there is a mask."""
-    if mask is None:
-        return plane.mean((1, 2, 3))
-    if mask.shape != plane.shape:
-        raise ValueError(f"expected a mask of shape {tuple(plane.shape)}, got {tuple(mask.shape)}")
-    weights = mask.to(plane.dtype)
-    # Nothing to read where there are no values, and nothing to raise in a compiled graph.
-    if (
-        not torch.compiler.is_compiling()
-        and has_values(weights)
-        and not bool((weights.isfinite() & (weights >= 0.0)).all())
-    ):
-        raise ValueError("expected finite mask values of 0 or more, got others; clamp the mask")
-    return (plane * weights).sum((1, 2, 3)) / weights.sum((1, 2, 3)).clamp_min(
-        torch.finfo(plane.dtype).tiny
-    )
+    def _weighted(self, plane: Tensor, mask: Tensor) -> Tensor:
+        """Return the mean of every item, (B,), weighted by a mask."""
+        if not isinstance(mask, Tensor) or mask.shape != plane.shape:
+            got = tuple(mask.shape) if isinstance(mask, Tensor) else type(mask).__name__
+            raise ValueError(f"expected a mask of shape {tuple(plane.shape)}, got {got}")
+        weights = mask.to(plane)
+        right = weights.isfinite() & (weights >= 0.0)
+        if self.metric._reads(weights) and not bool(right.all()):
+            raise ValueError("expected finite mask values of 0 or more, got others; clamp the mask")
+        weights = torch.where(right, weights, torch.nan)
+        return (plane * weights).sum((1, 2, 3)) / weights.sum((1, 2, 3)).clamp_min(
+            torch.finfo(plane.dtype).tiny
+        )

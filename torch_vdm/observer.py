@@ -1,8 +1,11 @@
 """Who looks: the parameters of the vision model."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
+
+from torch_vdm.options import number, switch
 
 # What is divided by, or is a root or a filter's place: never 0.
 POSITIVE = (
@@ -164,12 +167,25 @@ class Observer:
     charging: bool
 
     def __post_init__(self) -> None:
-        """Refuse numbers that no observer has."""
+        """Refuse what no observer has; numbers of NumPy or torch become Python's."""
+        if not isinstance(self.name, str):
+            raise ValueError(f"expected name: a string, got {self.name!r}")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.type is bool:
+                switch(field.name, value)
+            elif field.type is float or (field.type == float | None and value is not None):
+                object.__setattr__(self, field.name, number(field.name, value))
+        gains = self.lowpass_gains
+        if gains is not None:
+            if not isinstance(gains, Sequence) or isinstance(gains, str) or len(gains) != 3:
+                raise ValueError(f"expected lowpass_gains: three or None, got {gains!r}")
+            several = tuple(number("lowpass_gains", gain) for gain in gains)
+            object.__setattr__(self, "lowpass_gains", several)
         numbers = self.numbers()
-        gains = self.lowpass_gains or ()
-        if len(gains) not in (0, 3):
-            raise ValueError(f"expected lowpass_gains: three or None, got {gains}")
-        numbers |= {f"lowpass_gains[{place}]": gain for place, gain in enumerate(gains)}
+        numbers |= {
+            f"lowpass_gains[{place}]": gain for place, gain in enumerate(self.lowpass_gains or ())
+        }
         for name, value in numbers.items():
             if not math.isfinite(value) or value < 0.0 or (name in POSITIVE and value == 0.0):
                 least = "a finite number over 0" if name in POSITIVE else "a finite number from 0"
@@ -278,4 +294,4 @@ class Observer:
     def numbers(self) -> dict[str, float]:
         """Return the parameters that are plain numbers, by name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: float(value) for name, value in values.items() if type(value) in (float, int)}
+        return {name: value for name, value in values.items() if isinstance(value, float)}

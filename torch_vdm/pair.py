@@ -1,12 +1,13 @@
 """What every metric of two images shares: its options, its checks, its precision."""
 
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from typing import Any, Literal, Self
+from dataclasses import fields
+from typing import Any, Literal, Self, get_args
 
 import torch
 from torch import Tensor, nn
-from torch._subclasses.fake_tensor import is_fake
 from torch.utils.checkpoint import checkpoint
 
 from torch_vdm import operators
@@ -14,16 +15,50 @@ from torch_vdm.display import Display
 from torch_vdm.distance import just_noticeable
 from torch_vdm.fast import for_any_size
 from torch_vdm.grid import Grid
+from torch_vdm.images import (
+    HIGHEST_CODE,
+    MOST_BELOW,
+    advice,
+    can_be_read,
+    finite_in_both,
+    has_values,
+    masked,
+    range_of,
+    refuse_onnx,
+    remedy,
+    require_finite,
+)
 from torch_vdm.memory import keep_freed_memory
+from torch_vdm.observer import Observer
+from torch_vdm.options import choice, number
+from torch_vdm.precision import look_at, widest
 
 Nonfinite = Literal["raise", "mask"]
+
+# A number, or rows of numbers.
+Numbers = float | Sequence["Numbers"]
+
+# Constants that state dicts of before 0.1.0 held.
+FORMER = {field.name for field in fields(Observer)} | {
+    "primaries",
+    "cones",
+    "opponents",
+    "luminance_of_cones",
+    "dark_cones",
+    "frequencies",
+    "gains",
+    "band_frequencies",
+    "band_weights",
+    "luminance",
+    "sensitivities",
+}
 
 
 class PairMetric(nn.Module):
     """A metric that maps the visible differences of two images.
 
     Subclasses give the accumulated differences of two checked batches, and how a plane of them
-    becomes one of pixels; their constants are float64 buffers, ``summation_exponent`` among them.
+    becomes one of pixels; they set their constants, see `_set_constants`.
 
     Parameters
     ----------
@@ -40,18 +75,20 @@ class PairMetric(nn.Module):
         self, ppd: float, display: Display | None = None, nonfinite: Nonfinite = "raise"
     ) -> None:
         super().__init__()
-        if not 0.01 <= ppd <= 1e6:
+        self.ppd = number("pixels per degree", ppd)
+        if not 0.01 <= self.ppd <= 1e6:
             raise ValueError(f"expected pixels per degree between 0.01 and 1e6, got {ppd}")
         if not isinstance(display, Display | None):
             raise ValueError(f"expected display: Display, got {display!r}")
-        if nonfinite not in ("raise", "mask"):
-            raise ValueError(f'expected nonfinite "raise" or "mask", got {nonfinite!r}')
-        self.ppd = float(ppd)
+        choice("nonfinite", nonfinite, get_args(Nonfinite))
         self.display = display or Display.srgb()
         self.nonfinite = nonfinite
         self._fast = False
         self._checkpointed = False
         self._number = operators.enrol(self)
+        self._range_is_known = False
+        # In which of both images values out of range are told: any, or all.
+        self._out_of_range_in: Callable[[Iterable[bool]], bool] = any
         keep_freed_memory()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -85,15 +122,59 @@ class PairMetric(nn.Module):
         """
         raise NotImplementedError
 
+    def _set_constants(self, constants: Mapping[str, Numbers]) -> None:
+        """Keep constants, of which ``summation_exponent`` is one, and register them as buffers.
+
+        They follow from the options: no state dict has them.
+        """
+        self._exact = dict(constants)
+        for name in constants:
+            self.register_buffer(name, None, persistent=False)
+        self._place(torch.get_default_device())
+
+    def _place(self, device: torch.device) -> None:
+        """Make the constants on a device, anew from exact numbers.
+
+        Once for each precision of the computation, and once more as buffers, which show where the
+        module is. One that `torch.func.functional_call` replaces counts, and one that requires a
+        gradient; what else is done to it, as by a wrapper that casts it, changes no answer.
+        """
+        look_at(device)
+
+        def placed(dtype: torch.dtype) -> dict[str, Tensor]:
+            return {
+                name: torch.tensor(value, dtype=dtype, device=device)
+                for name, value in self._exact.items()
+            }
+
+        # Tensors of inference mode could not be trained with later.
+        with torch.inference_mode(False):
+            self._cast = {dtype: placed(dtype) for dtype in (torch.float32, widest(device))}
+            self._own = placed(widest(device))
+        self._buffers.update(self._own)
+
     def _apply(self, fn: Any, recurse: bool = True) -> Self:
         """Move the constants with the module, but never to a lower precision."""
-        exact = dict(self._buffers)
-        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]  # torch's own, without types
-        for name, moved in self._buffers.items():
-            constant = exact[name]
-            if moved is not None and constant is not None and moved.dtype != constant.dtype:
-                self._buffers[name] = constant.to(moved.device)
+        # In the precision that every device has.
+        self._buffers.update(self._cast[torch.float32])
+        try:
+            super()._apply(fn, recurse)  # type: ignore[no-untyped-call]  # torch's own
+        finally:
+            self._place(self.get_buffer("summation_exponent").device)
         return self
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **options: Any
+    ) -> None:
+        """Leave out the constants that checkpoints of before hold, with a warning."""
+        former = [name for name in FORMER if state_dict.pop(prefix + name, None) is not None]
+        if former:
+            warnings.warn(
+                f"the checkpoint holds {len(former)} constants of {type(self).__name__}, which are "
+                "no longer part of a state dict; they are left out, and this module's options stay",
+                stacklevel=2,
+            )
+        super()._load_from_state_dict(state_dict, prefix, *args, **options)
 
     def compile(self, *args: Any, **kwargs: Any) -> Self:  # type: ignore[override]
         """Switch to the fast route: one compiled function a level, for any size and batch.
@@ -147,8 +228,19 @@ class PairMetric(nn.Module):
 
     def _constants(self, dtype: torch.dtype, *names: str) -> dict[str, Tensor]:
         """Return constants in the precision of the computation: those named, or all."""
-        buffers = {name: getattr(self, name) for name in names} or dict(self.named_buffers())
-        return {name: value.to(dtype) for name, value in buffers.items()}
+        own, cast = self._own, self._cast
+        device = own["summation_exponent"].device
+        if device != cast[torch.float32]["summation_exponent"].device:  # a wrapper moved buffers
+            self._place(device)
+            own, cast = self._own, self._cast
+        exact, buffers = cast[dtype], self._buffers
+        found = {}
+        for name in names or own:
+            buffer = buffers[name]
+            assert buffer is not None
+            kept = buffer is own[name] and not buffer.requires_grad
+            found[name] = exact[name] if kept else buffer.to(dtype)
+        return found
 
     def _total(self, test: Tensor, reference: Tensor) -> Tensor:
         fast = self._fast and not torch.compiler.is_compiling()
@@ -171,6 +263,31 @@ class PairMetric(nn.Module):
             (one, other) if len(one) > 1 else (one.clone(), other.clone()) for one, other in parts
         )
 
+    def _require_image(self, name: str, image: Tensor) -> None:
+        """Raise where ``image`` is not such as the metric takes, and say what makes it so."""
+        if not isinstance(image, Tensor):
+            raise ValueError(
+                f"expected {name} that is a tensor (B, 3, H, W), got {type(image).__name__}; "
+                "torch.from_numpy makes one of an array"
+            )
+        shape = tuple(image.shape)
+        if len(shape) != 4 or shape[1] != 3 or 0 in shape:
+            raise ValueError(
+                f"expected {name} of shape (B, 3, H, W) with no side of 0, got {shape}"
+                f"{remedy(shape)}"
+            )
+        if not image.is_floating_point():
+            raise ValueError(
+                f"expected {name} of floating point, got {image.dtype}; "
+                "divide 8-bit values by 255, others by the largest that they may have"
+            )
+        place = self.get_buffer("summation_exponent").device
+        if image.device != place:
+            raise ValueError(
+                f"expected {name} where the metric is, on {place}, got one on {image.device}; "
+                f'move the metric with .to("{image.device}")'
+            )
+
     def _checked(
         self, test: Tensor, reference: Tensor, origin: tuple[int, int, int] = (0, 0, 0)
     ) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -178,17 +295,9 @@ class PairMetric(nn.Module):
 
         ``origin`` is where a part lies in a larger batch, for messages: item, y, x.
         """
-        for name, image in (("test", test), ("reference", reference)):
-            if image.ndim != 4 or image.shape[1] != 3 or 0 in image.shape:
-                raise ValueError(
-                    f"expected a {name} of shape (B, 3, H, W) with no side of 0, "
-                    f"got {tuple(image.shape)}"
-                )
-            if not image.is_floating_point():
-                raise ValueError(
-                    f"expected a {name} of floating point, got {image.dtype}; "
-                    "divide 8-bit values by 255"
-                )
+        refuse_onnx()
+        for name, image in (("a test", test), ("a reference", reference)):
+            self._require_image(name, image)
         if test.shape != reference.shape:
             raise ValueError(
                 "expected two images of one shape, "
@@ -198,81 +307,33 @@ class PairMetric(nn.Module):
         dtype = torch.float64 if double else torch.float32
         # In one layout: a tensor in another takes other paths through the vectorised loops, and
         # equal images would differ in their last bits.
-        test, reference = (
-            _widened(test, dtype).contiguous(),
-            _widened(reference, dtype).contiguous(),
-        )
+        test, reference = test.to(dtype).contiguous(), reference.to(dtype).contiguous()
+        seen: Tensor | None = None
         if self.nonfinite == "mask":
-            return finite_in_both(test, reference)
-        if not torch.compiler.is_compiling() and has_values(test):
-            _require_finite("test", test, origin)
-            _require_finite("reference", reference, origin)
-        return test, reference, None
+            test, reference, seen = finite_in_both(test, reference)
+        elif self._reads(test):
+            require_finite("test", test, origin)
+            require_finite("reference", reference, origin)
+        self._look_at_range(test, reference)
+        return test, reference, seen
 
+    def _reads(self, image: Tensor) -> bool:
+        """Return whether values are to be read back, to raise where they are wrong."""
+        return self.nonfinite == "raise" and not torch.compiler.is_compiling() and has_values(image)
 
-def finite_in_both(test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return both images with 0 where a channel of either is not finite, and where all are.
-
-    (B, 3, H, W) twice, and (B, 1, H, W), boolean.
-    """
-    seen = (torch.isfinite(test) & torch.isfinite(reference)).all(1, keepdim=True)
-    return torch.where(seen, test, 0.0), torch.where(seen, reference, 0.0), seen
-
-
-class _Widen(torch.autograd.Function):
-    """A cast to more bits whose gradient saturates on the way back instead of overflowing."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor, _: None) -> Tensor:
-        return tangent.to(ctx.wide)
-
-    @staticmethod
-    def forward(image: Tensor, dtype: torch.dtype) -> Tensor:
-        return image.to(dtype)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, torch.dtype], _: Tensor) -> None:
-        ctx.dtype, ctx.wide = inputs[0].dtype, inputs[1]
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        largest = torch.finfo(ctx.dtype).max
-        return gradient.clamp(-largest, largest).to(ctx.dtype), None
-
-
-def _widened(image: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return an image in ``dtype``, which holds at least as much as its own."""
-    if image.dtype not in (torch.float16, torch.bfloat16):
-        return image.to(dtype)
-    widened: Tensor = _Widen.apply(image, dtype)
-    return widened
-
-
-def masked(plane: Tensor, seen: Tensor | None) -> Tensor:
-    """Return a plane with 0 where a mask (B, 1, H, W) is not set."""
-    return plane if seen is None else torch.where(seen, plane, 0.0)
-
-
-def has_values(image: Tensor) -> bool:
-    """Return whether there is anything to read: not in a meta or a fake tensor."""
-    return not (image.is_meta or is_fake(image))
-
-
-def _require_finite(name: str, image: Tensor, origin: tuple[int, int, int]) -> None:
-    """Raise where ``image`` has NaN or infinity, naming the first such item and pixel."""
-    # One cheap pass: the sum of an image that is not finite is not.
-    if bool(torch.isfinite(image.detach().sum())):
-        return
-    bad = ~torch.isfinite(image.detach())
-    if not bool(bad.any()):
-        return
-    item = int(bad.flatten(1).any(1).nonzero()[0])
-    channel, y, x = bad[item].nonzero()[0].tolist()
-    raise ValueError(
-        f"expected finite pixel values, got {int(bad[item].sum())} NaN or infinite ones in the "
-        f"{name}'s batch item {item + origin[0]}, the first in channel {channel} "
-        f"at x {x + origin[2]}, y {y + origin[1]}; "
-        'repair them or pass nonfinite="mask"'
-    )
+    def _look_at_range(self, test: Tensor, reference: Tensor) -> None:
+        """Warn at the first call where values are no sRGB codes, but bytes or in [-1, 1]."""
+        if self._range_is_known or self.display.encoding != "srgb" or not can_be_read(test):
+            return
+        self._range_is_known = True
+        found = torch.stack([range_of(test), range_of(reference)]).tolist()
+        wrong = [highest > HIGHEST_CODE or below > MOST_BELOW for _, highest, below in found]
+        if self._out_of_range_in(wrong):
+            name = ("test", "reference")[wrong.index(True)]
+            lowest, highest, below = found[wrong.index(True)]
+            warnings.warn(
+                f"expected sRGB-coded values in [0, 1], got a {name} from {lowest:.4g} to "
+                f"{highest:.4g}; {advice(highest > HIGHEST_CODE, below > MOST_BELOW)}; "
+                "only the first call is looked at",
+                stacklevel=2,
+            )

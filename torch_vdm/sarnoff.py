@@ -6,6 +6,7 @@ chapter was not at hand: what is marked "recalled" is from memory, see docs/mode
 """
 
 import math
+from functools import partial
 from typing import NoReturn
 
 import torch
@@ -20,6 +21,7 @@ from torch_vdm.distance import local_visual_difference
 from torch_vdm.fast import SMALLEST, step
 from torch_vdm.grid import Grid
 from torch_vdm.masking import energy_transducer
+from torch_vdm.options import switch
 from torch_vdm.pair import Nonfinite, PairMetric
 
 # Line spread of the eye, the sum of weight exp(-decay x^2) and weight exp(-decay abs(x)), x in
@@ -90,19 +92,19 @@ class Sarnoff(PairMetric):
         nonfinite: Nonfinite = "raise",
     ) -> None:
         super().__init__(ppd, display, nonfinite)
-        if not 1.0 <= ppd <= 1200.0:
+        if not 1.0 <= self.ppd <= 1200.0:
             raise ValueError(
                 f"expected pixels per degree between 1 and 1200 for Sarnoff's model, got {ppd}"
             )
-        self.resample = bool(resample)
+        self.resample = switch("resample", resample)
         self._spread = _line_spread(self.ppd)
-        constants = {
-            "luminance": torch.tensor(BT709_TO_XYZ, dtype=torch.float64)[1:2].clone(),
-            "sensitivities": torch.tensor(self._sensitivities(), dtype=torch.float64),
-            "summation_exponent": torch.tensor(EXPONENT, dtype=torch.float64),
-        }
-        for name, value in constants.items():
-            self.register_buffer(name, value)
+        self._set_constants(
+            {
+                "luminance": BT709_TO_XYZ[1:2],
+                "sensitivities": self._sensitivities(),
+                "summation_exponent": EXPONENT,
+            }
+        )
 
     @property
     def frequencies(self) -> list[float]:
@@ -130,8 +132,9 @@ class Sarnoff(PairMetric):
         has an energy of 1: his sensitivity over what the optics and the pyramid leave of the
         grating. What aliases in the pyramid and what resampling blurs is not counted.
         """
-        luminance = torch.tensor(ADAPTATION, dtype=torch.float64)
-        size = torch.tensor(SIZE, dtype=torch.float64)
+        # On the processor, whatever the default device is: read back at once.
+        exact = partial(torch.tensor, dtype=torch.float64, device="cpu")
+        luminance, size = exact(ADAPTATION), exact(SIZE)
         weights = []
         for octave, frequency in enumerate(self.frequencies):
             cycles = min(frequency / self.ppd, 0.5)  # nothing is finer than a pixel
@@ -139,7 +142,7 @@ class Sarnoff(PairMetric):
             for finer in range(octave):
                 passed *= lowpass_response(BAND / 2.0 ** (octave - finer))
             passed *= 1.0 - lowpass_response(BAND) ** 2
-            sensitivity = barten(torch.tensor(frequency, dtype=torch.float64), luminance, size)
+            sensitivity = barten(exact(frequency), luminance, size)
             weights.append(float(sensitivity) / passed)
         return weights
 

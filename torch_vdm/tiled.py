@@ -15,8 +15,10 @@ from torch_vdm.cortex.haar import lowpass_of_light
 from torch_vdm.cortex.transform import Base
 from torch_vdm.distance import Paths, accumulate, just_noticeable
 from torch_vdm.grid import Before, Grid
+from torch_vdm.images import SQUARE, masked
 from torch_vdm.observer import Observer
-from torch_vdm.pair import PairMetric, masked
+from torch_vdm.pair import PairMetric
+from torch_vdm.precision import widest
 from torch_vdm.tiling import (
     TILE,
     Slices,
@@ -177,7 +179,7 @@ class TiledMetric(PairMetric):
 
     def _jnd(self, total: Tensor, part: Slices, grid: Grid, seen: Tensor | None) -> Tensor:
         """Return the map (h, w) of a tile."""
-        exponent = self.summation_exponent.to(total.dtype)
+        exponent = self._constants(total.dtype, "summation_exponent")["summation_exponent"]
         jnd = self._to_pixels(just_noticeable(total, exponent), _size(part), grid)
         return masked(jnd, seen)[0, 0]
 
@@ -202,8 +204,13 @@ class TiledMetric(PairMetric):
         passes = len(tiling) * (1 if tiling.whole else 2) + filtered * len(plain)
 
         def images(item: int, part: Slices) -> _Pair:
-            one, other = (read(source, item, part).to(device) for source in (test, reference))
-            one, other, seen = self._checked(one, other, (item, part[0].start, part[1].start))
+            wide = _in_squares(part, size) if self.nonfinite == "mask" else part
+            one, other = (read(source, item, wide).to(device) for source in (test, reference))
+            one, other, seen = self._checked(one, other, (item, wide[0].start, wide[1].start))
+            if wide != part:
+                inside = Tile(part, wide).within(1)
+                one, other = cut(one, inside), cut(other, inside)
+                seen = None if seen is None else cut(seen, inside)
             return _Pair([self._cone_planes(one), self._cone_planes(other)], seen)
 
         def step() -> None:
@@ -283,7 +290,7 @@ class TiledMetric(PairMetric):
         # its pixels.
         planes: tuple[list[Tensor], list[Tensor]] = [], []
         lights: tuple[list[Tensor], list[Tensor]] = [], []
-        sums = [torch.zeros(1, 1, 1, 1, dtype=torch.float64)] * 2
+        sums = [torch.zeros(1, 1, 1, 1)] * 2
         for tile in tiling:
             around = _around(tile, tiling, contrasts)
             grid = tiling.grid_of(tile.around)
@@ -296,7 +303,8 @@ class TiledMetric(PairMetric):
                     inner = cones if around.inner is None else cut(cones, around.inner)
                     reduced = self.transform.reduced(inner, octaves, *options, grid=grid)
                     lights[number].append(cut(reduced, tile.within(2**octaves)))
-                inside = cut(cones, around.pixels).double().sum((-2, -1), keepdim=True)
+                inside = cut(cones, around.pixels).to(widest(cones.device))
+                inside = inside.sum((-2, -1), keepdim=True)
                 sums[number] = sums[number].to(inside) + inside
             step()
         pixels = math.prod(tiling.size)
@@ -310,6 +318,15 @@ class TiledMetric(PairMetric):
                 cortex = lowpass_of_light(cortex, base, self.observer.true_means)
             coarse.append(cortex)
         return coarse
+
+
+def _in_squares(part: Slices, size: tuple[int, int]) -> Slices:
+    """Return a part made larger to whole squares, whose means may stand for pixels."""
+    rows, columns = (
+        slice(side.start // SQUARE * SQUARE, min(-(-side.stop // SQUARE) * SQUARE, length))
+        for side, length in zip(part, size, strict=True)
+    )
+    return rows, columns
 
 
 def _scales(tiling: Tiling) -> int:

@@ -237,6 +237,11 @@ def read(source: Source, item: int, part: Slices) -> Tensor:
 
 def check_sources(test: Source, reference: Source) -> tuple[int, tuple[int, int]]:
     """Return the number of items and (H, W) of two sources of one shape; refuse others."""
+    for name, source in (("test", test), ("reference", reference)):
+        if not hasattr(source, "shape"):
+            raise ValueError(
+                f"expected a {name} of shape (3, H, W) or (B, 3, H, W), got {type(source).__name__}"
+            )
     shapes = [tuple(int(side) for side in source.shape) for source in (test, reference)]
     for name, shape in zip(("test", "reference"), shapes, strict=True):
         if len(shape) not in (3, 4) or shape[-3] != 3 or 0 in shape:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -38,7 +39,7 @@ from torch_vdm.gradient import by_hand, local_difference
 from torch_vdm.grid import Before, Grid
 from torch_vdm.matrix import mix_row, product
 from torch_vdm.observer import Observer
-from torch_vdm.pair import Nonfinite
+from torch_vdm.pair import Nonfinite, Numbers
 from torch_vdm.pooling import (
     covering,
     phase_energy,
@@ -94,8 +95,9 @@ class VDM(TiledMetric):
     visible differences, (B, 1, H, W) in just-noticeable differences: 1 is just noticeable. The
     order of the two makes no difference, and equal images give exactly 0.
 
-    It computes in float64 where an input is float64, else in float32, under autocast too; its
-    constants are float64 buffers and keep that precision through `half()` and the like.
+    It computes in float64 where an input is float64, else in float32, under autocast too. Its
+    constants follow from its options: they move with the module, keep their precision through
+    `half()` and the like, and are no part of its state dict.
 
     Parameters
     ----------
@@ -113,8 +115,10 @@ class VDM(TiledMetric):
     nonfinite
         "raise": NaN or infinity in an image is a ValueError that names the batch item (a graph
         of torch.export cannot raise: there it gives NaN). To know, one number an image is read
-        back from the device, and nothing else ever is. "mask": such pixels are taken as equal in
-        both images, and the map is 0 there; nothing is read back.
+        back from the device, and one of a mask of `VDMLoss`. "mask": such pixels are taken as equal
+        in both images, with the value that one of them has, or else that of their surroundings,
+        and the map is 0 there; nothing is read back. In both cases the first call reads once more:
+        values that are no sRGB codes, where the display takes these, are told by a warning.
 
     Raises
     ------
@@ -138,18 +142,21 @@ class VDM(TiledMetric):
         ):
             if not isinstance(option, kind | None):
                 raise ValueError(f"expected {name}: {kind.__name__}, got {option!r}")
+        if isinstance(transform, type) or not isinstance(transform, Transform | None):
+            raise ValueError(
+                f"expected transform: Haar(), StationaryHaar() or Steerable(), got {transform!r}"
+            )
         self.transform = transform or Haar()
         self.observer = (observer or Observer.calibrated()).fitted_to(self.transform)
         self.effects = effects or Effects()
 
         peaks = [self.transform.peaks(level) for level in range(DEEPEST)]
-        cones = torch.tensor(XYZ_TO_SML, dtype=torch.float64)
-        constants = {
+        constants: dict[str, Numbers] = {
             "primaries": BT709_TO_XYZ,
             "cones": XYZ_TO_SML,
             "opponents": SML_TO_OPPONENTS if self.effects.chromatic else SML_TO_OPPONENTS[:1],
-            "luminance_of_cones": torch.linalg.inv(cones)[1:2],
-            "dark_cones": self.observer.dark_light * cones.sum(1),
+            "luminance_of_cones": np.linalg.inv(XYZ_TO_SML)[1:2].tolist(),
+            "dark_cones": [self.observer.dark_light * sum(row) for row in XYZ_TO_SML],
             "frequencies": [[self.ppd * frequency for frequency, _ in level] for level in peaks],
             # Without them the orientations keep what they have to one another.
             "gains": [
@@ -164,8 +171,7 @@ class VDM(TiledMetric):
         if self.transform.csf == "filter":
             constants["band_frequencies"] = [self.ppd * cycles for cycles in bands.frequencies()]
             constants["band_weights"] = bands.weights()
-        for name, value in constants.items():
-            self.register_buffer(name, torch.as_tensor(value, dtype=torch.float64))
+        self._set_constants(constants)
 
     @classmethod
     def paper(cls, ppd: float = 60.0, display: Display | None = None, **options: Any) -> Self:
@@ -301,9 +307,11 @@ class VDM(TiledMetric):
     def represent(self, image: Tensor) -> Cortex:
         """Return the cortex representation of an image: display, cones, transform.
 
-        ``image`` is (B, 3, H, W) in float32 or float64, as the display expects it.
+        ``image`` is (B, 3, H, W), as the display expects it; of half precision in float32.
         """
-        return self._decomposed(self._cone_planes(image))
+        self._require_image("an image", image)
+        dtype = torch.promote_types(image.dtype, torch.float32)
+        return self._decomposed(self._cone_planes(image.to(dtype).contiguous()))
 
     def _decomposed(
         self,

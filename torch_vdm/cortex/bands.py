@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -210,5 +211,4 @@ def weights() -> tuple[tuple[float, ...], ...]:
     neighbours' frequencies too: with these weights exactly that passes there.
     """
     shares = [[share(band, frequency) for band in range(MOST)] for frequency in frequencies()]
-    inverse = torch.linalg.inv(torch.tensor(shares, dtype=torch.float64))
-    return tuple(tuple(row) for row in inverse.tolist())
+    return tuple(tuple(row) for row in np.linalg.inv(shares).tolist())

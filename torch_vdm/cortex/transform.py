@@ -1,10 +1,12 @@
 """What every cortex transform is held to."""
 
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
 
 from torch import Tensor
 
 from torch_vdm.grid import PAPERS, Before, Grid
+from torch_vdm.options import choice
+from torch_vdm.precision import widest
 from torch_vdm.quadtree import apart, together
 
 # Levels that constants are made for: an image of 2^24 pixels a side.
@@ -16,8 +18,7 @@ CSF = Literal["levels", "filter"]
 
 def checked_csf(csf: str) -> None:
     """Raise ValueError where ``csf`` is none of the two."""
-    if csf not in ("levels", "filter"):
-        raise ValueError(f'expected csf "levels" or "filter", got {csf!r}')
+    choice("csf", csf, get_args(CSF))
 
 
 class Cortex(NamedTuple):
@@ -80,6 +81,7 @@ class Base(NamedTuple):
     mean: Tensor
 
 
+@runtime_checkable
 class Transform(Protocol):
     """A decomposition into levels on a quad-tree, and what each level responds to."""
 
@@ -187,7 +189,7 @@ def mean_of(planes: Tensor, items: int = 1) -> Tensor:
     The lowpass term takes the difference of two of them, 76 times and more: the rounding of a sum
     over millions of pixels would be seen.
     """
-    rows = planes.mean(-1, keepdim=True).double()
+    rows = planes.mean(-1, keepdim=True).to(widest(planes.device))
     if items > 1:
         return together(apart(rows, items).mean(-2, keepdim=True)).to(planes)
     return rows.mean(-2, keepdim=True).to(planes)

@@ -1,0 +1,134 @@
+"""What images may be, and what is done where they are not: in words, and to their pixels."""
+
+import sys
+
+import torch
+from torch import Tensor
+from torch._subclasses.fake_tensor import is_fake
+from torch.nn import functional
+
+from torch_vdm.quadtree import push
+
+# A picture that has a higher sRGB code than this, or a larger share of values below the lowest, is
+# taken for none: filters and noise leave less. Status: choice.
+HIGHEST_CODE, LOWEST_CODE, MOST_BELOW = 2.0, -0.1, 0.05
+
+# Pixels a side of the largest square whose mean stands for a pixel that no image has. Status:
+# choice.
+SQUARE = 64
+
+
+def refuse_onnx() -> None:
+    """Raise where a graph is made for ONNX."""
+    # Not imported for the question alone.
+    onnx = None if torch.compiler.is_dynamo_compiling() else sys.modules.get("torch.onnx")
+    if onnx is not None and onnx.is_in_onnx_export():
+        raise ValueError(
+            "expected no export to ONNX, which lacks operators that the metric needs; "
+            "use torch.export.export"
+        )
+
+
+def remedy(shape: tuple[int, ...]) -> str:
+    """Return what to do with an image of the wrong shape, as the end of a message."""
+    if 0 in shape:
+        return ""
+    match shape:
+        case (3, _, _):
+            return "; give it a batch of one, image[None]"
+        case (_, 1, _, _):
+            return "; repeat the channel of a grey image, image.expand(-1, 3, -1, -1)"
+        case (*_, _, _, 3):
+            return "; put channels first, image.movedim(-1, -3), in (B, 3, H, W)"
+        case (_, 4, _, _):
+            return "; composite it and leave out alpha, image[:, :3]"
+        case (_, _) | (1, _, _):
+            return "; repeat a grey image as three channels, image.expand(1, 3, -1, -1)"
+        case _:
+            return ""
+
+
+def has_values(image: Tensor) -> bool:
+    """Return whether there is anything to read: not in a meta or a fake tensor."""
+    return not (image.is_meta or is_fake(image))
+
+
+def can_be_read(image: Tensor) -> bool:
+    """Return whether values can be read back here, and are an image's own."""
+    return not (
+        torch.compiler.is_compiling()
+        or not has_values(image)
+        or torch._C._are_functorch_transforms_active()
+        or (image.is_cuda and torch.cuda.is_current_stream_capturing())
+    )
+
+
+def require_finite(name: str, image: Tensor, origin: tuple[int, int, int]) -> None:
+    """Raise where ``image`` has NaN or infinity, naming the first such item and pixel."""
+    # One cheap pass: the sum of an image that is not finite is not.
+    if bool(torch.isfinite(image.detach().sum())):
+        return
+    bad = ~torch.isfinite(image.detach())
+    if not bool(bad.any()):
+        return
+    item = int(bad.flatten(1).any(1).nonzero()[0])
+    channel, y, x = bad[item].nonzero()[0].tolist()
+    raise ValueError(
+        f"expected finite pixel values, got {int(bad[item].sum())} NaN or infinite ones in the "
+        f"{name}'s batch item {item + origin[0]}, the first in channel {channel} "
+        f"at x {x + origin[2]}, y {y + origin[1]}; "
+        'repair them or pass nonfinite="mask"'
+    )
+
+
+def range_of(image: Tensor) -> Tensor:
+    """Return the lowest and the highest value of an image, and the share of those below 0."""
+    image = image.detach()
+    below = (image < LOWEST_CODE).to(image).mean()
+    return torch.stack([image.amin(), image.amax(), below])
+
+
+def advice(high: bool, low: bool) -> str:
+    """Return what to do with values out of range, as a part of a message."""
+    if high and low:
+        return "undo its normalisation"
+    if high:
+        return "divide 8-bit values by 255, or give light a Display.linear or Display.xyz"
+    return "take (image + 1) / 2 of values in [-1, 1]"
+
+
+def masked(plane: Tensor, seen: Tensor | None) -> Tensor:
+    """Return a plane with 0 where a mask (B, 1, H, W) is not set."""
+    return plane if seen is None else torch.where(seen, plane, 0.0)
+
+
+def finite_in_both(test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return both images, equal where a channel of either is not finite, and where all are.
+
+    (B, 3, H, W) twice, and (B, 1, H, W), boolean. A pixel that one image has is taken for both;
+    one that neither has gets the mean of the smallest square around it in which there is any, of
+    2, 4 ... `SQUARE` pixels a side from the image's corner, so that it hides nothing around it.
+    """
+    images = test.detach(), reference.detach()
+    finite = [torch.isfinite(image).all(1, keepdim=True) for image in images]
+    known = [torch.where(there, image, 0.0) for image, there in zip(images, finite, strict=True)]
+    value = torch.where(finite[0], known[0], known[1])
+    total = 0.5 * known[0] + 0.5 * known[1]
+    count = 0.5 * finite[0].to(total) + 0.5 * finite[1].to(total)
+    either, seen = finite[0] | finite[1], finite[0] & finite[1]
+    filled = torch.where(either, value, _around(total, count, SQUARE))
+    return torch.where(seen, test, filled), torch.where(seen, reference, filled), seen
+
+
+def _around(total: Tensor, count: Tensor, side: int) -> Tensor:
+    """Return at every pixel the mean of the smallest square that has any; 0 where none has.
+
+    ``total`` (B, C, h, w) over ``count`` (B, 1, h, w) is the mean; the largest square has ``side``
+    pixels.
+    """
+    mean = torch.where(count > 0.0, total / count, 0.0)
+    if side == 1:
+        return mean
+    coarse = [functional.avg_pool2d(plane, 2, ceil_mode=True) for plane in (total, count)]
+    wider = _around(coarse[0], coarse[1], side // 2)
+    return torch.where(count > 0.0, mean, push(wider, (total.shape[-2], total.shape[-1])))
