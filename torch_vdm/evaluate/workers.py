@@ -25,7 +25,9 @@ class _Hand(NamedTuple):
     job: Job
 
 
-def results(judge: Judge, jobs: Sequence[Job], known: Known, count: int) -> Generator[Result, None, None]:
+def results(
+    judge: Judge, jobs: Sequence[Job], known: Known, count: int
+) -> Generator[Result, None, None]:
     """Yield the results of jobs as they come.
 
     Parameters
