@@ -95,7 +95,7 @@ def match(reference: str, tests: Mapping[str, str], output: Path) -> Matched:
             pair = references.get(frame, []), paths.get(frame, [])
             why = _why_not(frame, *pair)
             if why:
-                missing.append(Missing(frame, test, why))
+                missing.append(Missing(printable(frame), test, printable(why)))
             else:
                 jobs.append(Job(frame, test, pair[0][0], pair[1][0]))
     return Matched(list(tests), _with_predecessors(jobs), missing)
@@ -183,28 +183,37 @@ def _hidden(path: Path) -> bool:
 
 
 def _by_pattern(pattern: str) -> Iterator[tuple[str, Path]]:
-    """Yield what a pattern finds, named by what its wildcards stand for."""
+    """Yield what a pattern finds, named by what its wildcards stand for, but for the suffix."""
     pattern = Path(pattern).as_posix()
-    expression, between, end = "", [], 0
-    for wildcard in WILDCARDS.finditer(pattern):
-        literal = pattern[end : wildcard.start()]
-        between.append("/" if "/" in literal else "-")
-        expression += re.escape(literal) + _group(wildcard.group())
-        end = wildcard.end()
-    whole = re.compile(expression + re.escape(pattern[end:]), re.DOTALL)
+    without_suffix = re.sub(r"\.[^./]*$", "", pattern)
+    expressions = [_expression(each) for each in (without_suffix, pattern)]
     for found in glob.glob(pattern, recursive=True):  # noqa: PTH207 - Path.glob needs a root
         path = Path(found)
-        matched = whole.fullmatch(path.as_posix())
-        if matched is None:
-            continue
-        name = ""
-        for joint, part in zip(between, matched.groups(), strict=True):
-            if part:
-                name += (joint if name and not name.endswith("/") else "") + part
-        # The wildcard may stand for the suffix too.
-        suffix = Path(name).suffix
-        stem = name[: -len(suffix)] if suffix.lower() in SUFFIXES and end == len(pattern) else name
-        yield stem.strip("/"), path
+        stem = path.with_suffix("").as_posix()
+        for expression, joints in expressions:
+            matched = expression.fullmatch(stem)
+            if matched:
+                yield _joined(joints, matched.groups()), path
+                break
+
+
+def _expression(pattern: str) -> tuple[re.Pattern[str], list[str]]:
+    """Return a pattern with a group for each wildcard, and what joins each to those before."""
+    expression, joints, end = "", [], 0
+    for wildcard in WILDCARDS.finditer(pattern):
+        literal = pattern[end : wildcard.start()]
+        joints.append("/" if "/" in literal else "-")
+        expression += re.escape(literal) + _group(wildcard.group())
+        end = wildcard.end()
+    return re.compile(expression + re.escape(pattern[end:]), re.DOTALL), joints
+
+
+def _joined(joints: Iterable[str], parts: Iterable[str | None]) -> str:
+    name = ""
+    for joint, part in zip(joints, parts, strict=True):
+        if part:
+            name += (joint if name and not name.endswith("/") else "") + part
+    return name.strip("/")
 
 
 def _group(wildcard: str) -> str:

@@ -114,6 +114,8 @@ def _results(path: Path) -> Iterator[Result]:
         return
     with file:
         for line in file:
+            if not line.endswith(b"\n"):
+                return
             try:
                 fields: Any = json.loads(line)
                 result = Result(**fields)

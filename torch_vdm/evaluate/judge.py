@@ -162,8 +162,8 @@ class Judge:
             "visible_fraction": told["visible_fraction"],
         }
         values["mean_luminance_change"] = _luminance_change(*light)
-        values |= self._peers(*light, metric)
         said = [*notes]
+        values |= self._peers(*light, metric, said)
         if self.options.flicker and job.before:
             values |= self._flicker(job, pair, light, metric, said)
         return _Judged(jnd, *light, pair, metric, values, said, seconds)
@@ -182,11 +182,17 @@ class Judge:
         jnd: Tensor = metric(_whole(test), _whole(reference))[0, 0]
         return jnd
 
-    def _peers(self, reference: Tensor, test: Tensor, metric: VDM) -> dict[str, float | None]:
-        coded = [encode_srgb(image).clamp(0.0, 1.0) for image in (test, reference)]
-        values: dict[str, float | None] = {"psnr": peers.psnr(*coded), "ssim": peers.ssim(*coded)}
-        for name in self.options.peers:
-            values[name] = peers.asked(name, test, reference, metric.ppd, metric.display.white)
+    def _peers(
+        self, reference: Tensor, test: Tensor, metric: VDM, notes: list[str]
+    ) -> dict[str, float | None]:
+        """Return what other metrics say; one that fails, as on very small images, is told of."""
+        values: dict[str, float | None] = {}
+        for name in ("psnr", "ssim", *self.options.peers):
+            try:
+                values[name] = peers.judged(name, test, reference, metric.ppd, metric.display.white)
+            except Exception as error:  # whatever another's code raises
+                values[name] = None
+                notes.append(f"no {name}: {' '.join(str(error).split())}")
         return values
 
     def _flicker(

@@ -63,29 +63,29 @@ function showVerdicts() {
 }
 
 function showTests() {
+  const own = data.tests.map((_, number) => rows.filter((row) => row.test === number));
   const head = $("tests").createTHead().insertRow();
-  for (const text of ["test", "frames", "worst"]) head.append(element("th", text, { scope: "col" }));
-  for (const figure of data.figures) {
-    head.append(element("th", figure.label, { scope: "col", title: figure.help }));
-  }
+  head.append(element("td"));
+  for (const test of data.tests) head.append(element("th", test, { scope: "col" }));
   const body = $("tests").createTBody();
-  data.tests.forEach((test, number) => {
-    const own = rows.filter((row) => row.test === number);
+  const add = (label, help, tell) => {
     const line = body.insertRow();
-    line.append(element("td", test), element("td", own.length));
-    line.append(element("td", own.length ? own.reduce((most, row) => Math.max(most, maximum(row)), 0).toFixed(2) : "–"));
-    data.figures.forEach((figure, place) => {
-      const values = own.map((row) => row.values[place]).filter((value) => value !== null);
-      line.append(element("td", values.length ? shown(figure, median(values)) : "–"));
-    });
-  });
+    line.append(element("th", label, { scope: "row", title: help }));
+    for (const some of own) line.append(element("td", some.length ? tell(some) : "–"));
+  };
+  add("frames", "Frames that were compared", (some) => some.length);
+  add("worst max", "The largest difference in any frame, JND", (some) => some.reduce((most, row) => Math.max(most, maximum(row)), 0).toFixed(2));
+  data.figures.forEach((figure, place) => add(figure.label, figure.help, (some) => {
+    const values = some.map((row) => row.values[place]).filter((value) => value !== null);
+    return values.length ? shown(figure, median(values)) : "–";
+  }));
 }
 
 function showCourse() {
   const frames = [...new Set(rows.map((row) => row.frame))];
   const place = new Map(frames.map((frame, number) => [frame, number]));
   if (!rows.length) return;
-  const width = 640, height = 220, left = 38, bottom = 24;
+  const width = Math.max(300, $("course").clientWidth), height = Math.min(300, 150 + width / 4), left = 38, bottom = 24;
   const top = rows.reduce((most, row) => Math.max(most, maximum(row)), 1.2);
   const x = (frame) => left + (width - left - 8) * (frames.length > 1 ? place.get(frame) / (frames.length - 1) : 0.5);
   const y = (jnd) => (height - bottom) - (height - bottom - 8) * jnd / top;
@@ -142,12 +142,17 @@ function showWorst() {
   all.sort((a, b) => b.region[4] - a.region[4]);
   for (const { row, region } of all.slice(0, 20)) {
     const link = element("a", null, { href: address(row, region) });
-    const picture = element("span", null, { class: "picture" });
-    picture.append(element("img", null, {
+    const box = element("span", null, { class: "picture" });
+    const inner = element("span", null, { style: `aspect-ratio:${row.width}/${row.height}` });
+    inner.append(element("img", null, {
       loading: "lazy", decoding: "async", src: thumbnail(row),
       alt: `Map of ${row.frame}, ${testName(row)}`,
     }));
-    link.append(picture, element("span",
+    const share = [region[0] / row.width, region[1] / row.height, region[2] / row.width, region[3] / row.height];
+    const sides = ["left", "top", "width", "height"];
+    inner.append(element("i", null, { style: sides.map((side, at) => `${side}:${100 * share[at]}%`).join(";") }));
+    box.append(inner);
+    link.append(box, element("span",
       `${region[4].toFixed(2)} JND, ${row.frame}, ${testName(row)}, at x ${region[0]}, y ${region[1]}`, { class: "caption" }));
     $("worst").append(link);
   }
@@ -274,7 +279,7 @@ function arrived(name) {
   return arriving.get(name).promise.finally(() => arriving.delete(name));
 }
 
-async function picture(name) {
+async function unpacked(name) {
   if (decoded.has(name)) return keep(decoded, name, decoded.get(name));
   const { width, height, kind, text } = await arrived(name);
   const packed = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
@@ -318,7 +323,7 @@ function codedTable(stops) {
 }
 
 async function layer(name) {
-  const source = await picture(name);
+  const source = await unpacked(name);
   const key = source.kind === "map" ? `${name} ${view.top}` : `${name} ${view.stops}`;
   if (layers.has(key)) return keep(layers, key, layers.get(key));
   const canvas = document.createElement("canvas");
@@ -345,7 +350,7 @@ async function layer(name) {
 // The frame -----------------------------------------------------------------------------------
 
 // `scale` is screen pixels for a picture's pixel; `x`, `y` the picture's place in the middle of a pane.
-const view = { row: null, scale: 1, x: 0, y: 0, stops: 0, top: 2, slider: 0.5, pointer: null, drawn: 0 };
+const view = { row: null, scale: 1, x: 0, y: 0, stops: 0, top: 2, slider: 0.5, pointer: null, drawn: false };
 const canvas = $("canvas");
 const context = canvas.getContext("2d");
 let region = null;
@@ -426,7 +431,7 @@ function showHistogram() {
   const { counts } = view.row, borders = data.borders;
   const total = counts.reduce((sum, count) => sum + count, 0);
   const most = counts.reduce((a, b) => Math.max(a, b), 1);
-  const width = 300, height = 170, left = 34, bottom = 34, top = 8, right = 6;
+  const width = 300, height = 170, left = 42, bottom = 34, top = 8, right = 6;
   const x = (border) => left + (width - left - right) * border / counts.length;
   const y = (share) => (height - bottom) - (height - bottom - top) * share;
   const svg = drawn("svg", { viewBox: `0 0 ${width} ${height}`, role: "img" });
@@ -463,7 +468,7 @@ function showScale() {
   bar.putImageData(image, 0, 0);
   const marks = ticks(view.top, 4);
   const last = marks[marks.length - 1];
-  if (last > 0.86 * view.top) marks.pop();
+  if (last > 0.75 * view.top) marks.pop();
   $("ticks").replaceChildren(...marks.map((tick) => element("span", tick, { style: `left:${100 * tick / view.top}%` })),
     element("span", `${view.top} JND`, { style: "left:100%" }));
 }
@@ -523,6 +528,10 @@ function pan(right, down) {
 }
 
 function resize() {
+  // As high as the picture asks for; the page's style holds it to the screen.
+  const { row } = view, wide = canvas.parentElement.clientWidth > 700;
+  const across = $("mode").value === "slider" ? 1 : wide ? 3 : 1 / 3;
+  canvas.style.aspectRatio = String(across * row.width / row.height);
   const box = canvas.getBoundingClientRect();
   canvas.width = Math.max(1, Math.round(box.width * devicePixelRatio));
   canvas.height = Math.max(1, Math.round(box.height * devicePixelRatio));
@@ -532,14 +541,18 @@ let asked = 0;
 async function draw() {
   if (!view.row) return;
   const number = ++asked;
+  canvas.dataset.asked = number;
   const names = layerNames();
   const wanted = panes();
   $("state").textContent = "";
   const late = setTimeout(() => { $("state").textContent = "Loading pictures …"; }, 300);
   try {
     const ready = await Promise.all(wanted.map((pane) => Promise.all(pane.layers.map((name) => layer(names[name])))));
-    await picture(view.row.pictures[2]); // for the value under the pointer
-    if (number === asked) paint(wanted, ready);
+    await unpacked(view.row.pictures[2]); // for the value under the pointer
+    if (number === asked) {
+      paint(wanted, ready);
+      canvas.dataset.painted = number;
+    }
   } catch (error) {
     if (number === asked) { $("state").textContent = error.message; }
   } finally {
@@ -585,8 +598,7 @@ function paint(wanted, ready) {
   const what = wanted.map((pane) => pane.layers.map(layerText).join(" left and ") + (pane.layers.length > 1 ? " right" : "")).join(", ");
   const [x, y] = view.row.peak;
   canvas.setAttribute("aria-label", `${what}, of frame ${view.row.frame}; the largest difference is ${maximum(view.row).toFixed(2)} JND at x ${x}, y ${y}`);
-  view.drawn += 1;
-  canvas.dataset.drawn = view.drawn;
+  view.drawn = true;
   showValue();
 }
 
@@ -768,6 +780,7 @@ document.addEventListener("keydown", (event) => {
 
 function changeMode() {
   for (const picked of document.querySelectorAll(".pick")) picked.hidden = $("mode").value !== "slider";
+  resize();
   fit();
   draw();
 }

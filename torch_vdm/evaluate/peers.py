@@ -6,6 +6,8 @@ import math
 import torch
 from torch import Tensor
 
+from torch_vdm.display import encode_srgb
+
 # The side of SSIM's window, in pixels. Source: Wang et al. 2004. Status: source.
 SSIM_WINDOW = 11
 
@@ -19,35 +21,20 @@ PACKAGES = {"flip": "flip_evaluator", "cvvdp": "pycvvdp"}
 EXTRA = "pip install 'torch-vdm[peers]'"
 
 
-def psnr(test: Tensor, reference: Tensor) -> float | None:
-    """Return PSNR in dB of two sRGB-coded images (3, H, W) in [0, 1]; None where they are equal."""
-    error = (test.double() - reference.double()).square().mean().item()
-    return -10.0 * math.log10(error) if error > 0.0 else None
-
-
-def ssim(test: Tensor, reference: Tensor) -> float:
-    """Return the mean SSIM of the luma of two sRGB-coded images (3, H, W) in [0, 1]."""
-    from kornia.metrics import ssim as kornia_ssim
-
-    weights = torch.tensor(LUMA).view(3, 1, 1)
-    one, other = ((image * weights).sum(0)[None, None] for image in (test, reference))
-    similarity: Tensor = kornia_ssim(one, other, SSIM_WINDOW)
-    return similarity.double().mean().item()
-
-
 def missing(names: list[str]) -> list[str]:
     """Return those of the peers whose package is not installed."""
     return [name for name in names if importlib.util.find_spec(PACKAGES[name]) is None]
 
 
-def asked(name: str, test: Tensor, reference: Tensor, ppd: float, white: float) -> float:
-    """Return what a peer says of two images (3, H, W) of light, where 1.0 is white.
+def judged(name: str, test: Tensor, reference: Tensor, ppd: float, white: float) -> float | None:
+    """Return what a peer says of two images of light (3, H, W), where 1.0 is white.
 
     Parameters
     ----------
     name
-        "flip": the mean error of the images as sRGB shows them, 0 to 1, less is better; "cvvdp":
-        quality in JOD, 10 is best.
+        Of the images as sRGB shows them, clipped to [0, 1]: "psnr" in dB, None where they are
+        equal; "ssim", the mean over the image of their luma; "flip", the mean error, 0 to 1, less
+        is better. Of the light: "cvvdp", quality in JOD, 10 is best.
     test, reference
         The images.
     ppd
@@ -55,18 +42,32 @@ def asked(name: str, test: Tensor, reference: Tensor, ppd: float, white: float) 
     white
         Luminance of 1.0, in cd/m2.
     """
-    return (_flip if name == "flip" else _cvvdp)(test, reference, ppd, white)
+    if name == "cvvdp":
+        return _cvvdp(test, reference, ppd, white)
+    one, other = (encode_srgb(image).clamp(0.0, 1.0) for image in (test, reference))
+    if name == "flip":
+        return _flip(one, other, ppd)
+    return _psnr(one, other) if name == "psnr" else _ssim(one, other)
 
 
-def _flip(test: Tensor, reference: Tensor, ppd: float, _: float) -> float:
+def _psnr(test: Tensor, reference: Tensor) -> float | None:
+    error = (test.double() - reference.double()).square().mean().item()
+    return -10.0 * math.log10(error) if error > 0.0 else None
+
+
+def _ssim(test: Tensor, reference: Tensor) -> float:
+    from kornia.metrics import ssim
+
+    weights = torch.tensor(LUMA).view(3, 1, 1)
+    one, other = ((image * weights).sum(0)[None, None] for image in (test, reference))
+    similarity: Tensor = ssim(one, other, SSIM_WINDOW)
+    return similarity.double().mean().item()
+
+
+def _flip(test: Tensor, reference: Tensor, ppd: float) -> float:
     import flip_evaluator
 
-    from torch_vdm.display import encode_srgb
-
-    images = (
-        encode_srgb(image).clamp(0.0, 1.0).permute(1, 2, 0).contiguous().numpy()
-        for image in (reference, test)
-    )
+    images = (image.permute(1, 2, 0).contiguous().numpy() for image in (reference, test))
     parameters = {"ppd": ppd}
     _, mean, _ = flip_evaluator.evaluate(*images, "LDR", applyMagma=False, parameters=parameters)
     return float(mean)

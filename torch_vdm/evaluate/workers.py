@@ -14,6 +14,7 @@ import torch
 from torch_vdm.evaluate.frames import Job
 from torch_vdm.evaluate.journal import Result
 from torch_vdm.evaluate.judge import Judge
+from torch_vdm.io.refusal import printable
 
 Known = Mapping[tuple[str, str], Result]
 
@@ -115,9 +116,12 @@ def _end(connection: Connection, hand: _Hand) -> None:
 def _died(connection: Connection, hand: _Hand) -> Result:
     """Return the result of a job whose process died."""
     hand.process.join()
-    why = f"{hand.job.path}: the process that compared it died (exit code {hand.process.exitcode})"
+    why = (
+        f"{hand.job.path}: the process that compared it died (exit code {hand.process.exitcode}); "
+        "give it more memory, or use fewer --jobs"
+    )
     _end(connection, hand)
-    return Result(frame=hand.job.frame, test=hand.job.test, skipped=f"{why}; is there memory?")
+    return Result(frame=hand.job.frame, test=hand.job.test, skipped=printable(why))
 
 
 @contextmanager
