@@ -110,7 +110,7 @@ def test_broken_frames_are_told_and_counted(
     write_image(folders / "a/004.exr", torch.full((3, 24, 32), torch.nan))
     (folders / "a/005.exr").write_bytes(b"")
     write_image(folders / "a/099.exr", torch.rand(3, 5, 5))
-    assert main(arguments(folders, "--junit", f"{folders}/junit.xml", "--fail-above", "0")) == 1
+    assert main(arguments(folders, "--junit", f"{folders}/out/junit.xml", "--fail-above", "0")) == 1
     said = capsys.readouterr().out
     assert f"Skipped 7 of {2 * FRAMES + 2} comparisons" in said
     skipped = {
@@ -123,7 +123,7 @@ def test_broken_frames_are_told_and_counted(
     }  # fmt: skip
     assert "expected the size of" in skipped["003", "A"]
     assert "NaN" in skipped["004", "A"]
-    suite = ElementTree.parse(folders / "junit.xml").getroot()
+    suite = ElementTree.parse(folders / "out/junit.xml").getroot()
     counts = {each.get("name"): each for each in suite}
     assert (counts["A"].get("tests"), counts["A"].get("skipped")) == ("9", "6")
     assert counts["A"].get("failures") == str(FRAMES - 5)
@@ -133,7 +133,6 @@ def test_broken_frames_are_told_and_counted(
 @pytest.mark.parametrize(("limit", "status"), [("0.01", 1), ("1000", 0)])
 def test_fail_above_is_told_by_the_status(folders: Path, limit: str, status: int) -> None:
     assert main(arguments(folders, "--fail-above", limit)) == status
-    (folders / "junit.xml").write_text("")
     assert main(arguments(folders, "--fail-above", limit, "--resume")) == status
 
 

@@ -1,6 +1,7 @@
 """What is known of one frame: places, counts, pictures, flicker, peers."""
 
 import base64
+import math
 import re
 import zlib
 from pathlib import Path
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torch_vdm import VDM, Display
+from torch_vdm.display import decode_srgb, encode_srgb
 from torch_vdm.evaluate import flicker, maps, peers, pictures
 
 
@@ -70,8 +72,6 @@ def test_light_keeps_its_values_to_8_bits_of_the_largest_channel(tmp_path: Path)
 
 def test_coded_images_keep_their_bytes(tmp_path: Path) -> None:
     codes = torch.arange(256, dtype=torch.float32).view(1, 16, 16).expand(3, -1, -1) / 255.0
-    from torch_vdm.display import decode_srgb
-
     name = pictures.write_image(tmp_path, decode_srgb(codes), coded=True)
     kind, planes = unpacked(pictures.path_of(tmp_path, name))
     assert kind == "coded"
@@ -133,15 +133,30 @@ def test_light_that_is_not_there_is_not_taken_away() -> None:
 
 
 def test_peers_say_what_they_say_elsewhere() -> None:
+    from kornia.metrics import ssim
+
     generator = torch.Generator().manual_seed(2)
-    reference = torch.rand(3, 32, 32, generator=generator)
-    test = reference * 0.9
-    assert peers.judged("psnr", reference, reference, 60.0, 100.0) is None
-    assert peers.judged("ssim", reference, reference, 60.0, 100.0) == pytest.approx(1.0)
-    psnr = peers.judged("psnr", test, reference, 60.0, 100.0)
-    assert psnr == pytest.approx(28.0, abs=2.0)
-    pytest.importorskip("flip_evaluator")
-    assert peers.judged("flip", reference, reference, 60.0, 100.0) == 0.0
-    flip = peers.judged("flip", test, reference, 60.0, 100.0)
-    assert flip is not None
-    assert 0.0 < flip < 0.3
+    for size in ((32, 40), (11, 11), (13, 30), (15, 12)):
+        reference = torch.rand(3, *size, generator=generator)
+        test = reference * 0.9
+        names = ("psnr", "ssim", "flip")
+        values, notes = peers.judged(names, test, reference, 60.0, 100.0)
+        assert notes == []
+        coded = [encode_srgb(image) for image in (test, reference)]
+        error = (coded[0] - coded[1]).square().mean().item()
+        assert values["psnr"] == pytest.approx(-10.0 * math.log10(error), rel=1e-5)
+        one, other = (torch.tensordot(torch.tensor(peers.LUMA), each, 1) for each in coded)
+        whole = ssim(one[None, None], other[None, None], 11, padding="valid").mean().item()
+        assert values["ssim"] == pytest.approx(whole, rel=1e-5)
+        assert values["flip"] is not None
+        assert 0.0 < values["flip"] < 0.3
+
+
+def test_peers_of_equal_and_of_small_images() -> None:
+    image = torch.rand(3, 12, 12)
+    values, _ = peers.judged(("psnr", "ssim"), image, image, 60.0, 100.0)
+    assert values == {"psnr": None, "ssim": pytest.approx(1.0)}
+    values, notes = peers.judged(("psnr", "ssim"), image[:, :3], 0.5 * image[:, :3], 60.0, 100.0)
+    assert values["ssim"] is None
+    assert values["psnr"] is not None
+    assert notes == ["no ssim: expected 11 pixels a side or more"]

@@ -159,9 +159,9 @@ def _check_installed(options: argparse.Namespace) -> None:
     if missing:
         raise EvaluationError(f"--peers {','.join(missing)}: not installed; {peers.EXTRA}")
     if options.parquet and importlib.util.find_spec("pyarrow") is None:
-        raise EvaluationError("--parquet: not installed; pip install pyarrow")
-    if options.junit:
-        check_target(options.junit)
+        raise EvaluationError(
+            "--parquet: pyarrow is not installed; pip install 'torch-vdm[report]'"
+        )
 
 
 def _prepared(options: argparse.Namespace) -> dict[tuple[str, str], Result]:
@@ -176,6 +176,8 @@ def _prepared(options: argparse.Namespace) -> dict[tuple[str, str], Result]:
             "--resume, or name another"
         )
     output.mkdir(parents=True, exist_ok=True)
+    if options.junit:  # it may lie in the output folder
+        check_target(options.junit)
     return journal.read(output)
 
 
@@ -199,13 +201,11 @@ def _worked_through(
         _progress(matched.jobs) as advance,
     ):
         for key, result in results.items():
-            if known.get(key) != result:
-                lines.add(result)
+            _add(lines, known.get(key), result)
         try:
             for result in coming:
                 key = result.frame, result.test
-                if known.get(key) != result:
-                    lines.add(result)
+                _add(lines, known.get(key), result)
                 results[key] = result
                 advance()
         except KeyboardInterrupt:
@@ -220,6 +220,12 @@ def _worked_through(
     return [
         results[key] for key in sorted(results, key=lambda key: (natural(key[0]), place[key[1]]))
     ]
+
+
+def _add(lines: Journal, known: Result | None, result: Result) -> None:
+    """Add a result to the journal, unless the journal has it."""
+    if known is None or known.line() != result.line():
+        lines.add(result)
 
 
 @contextmanager

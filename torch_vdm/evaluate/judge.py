@@ -162,8 +162,10 @@ class Judge:
             "visible_fraction": told["visible_fraction"],
         }
         values["mean_luminance_change"] = _luminance_change(*light)
-        said = [*notes]
-        values |= self._peers(*light, metric, said)
+        names = ("psnr", "ssim", *self.options.peers)
+        others, failed = peers.judged(names, light[1], light[0], metric.ppd, pair.display.white)
+        values |= others
+        said = [*notes, *failed]
         if self.options.flicker and job.before:
             values |= self._flicker(job, pair, light, metric, said)
         return _Judged(jnd, *light, pair, metric, values, said, seconds)
@@ -181,19 +183,6 @@ class Judge:
             return metric.tiled(test, reference, tile)[0]
         jnd: Tensor = metric(_whole(test), _whole(reference))[0, 0]
         return jnd
-
-    def _peers(
-        self, reference: Tensor, test: Tensor, metric: VDM, notes: list[str]
-    ) -> dict[str, float | None]:
-        """Return what other metrics say; one that fails, as on very small images, is told of."""
-        values: dict[str, float | None] = {}
-        for name in ("psnr", "ssim", *self.options.peers):
-            try:
-                values[name] = peers.judged(name, test, reference, metric.ppd, metric.display.white)
-            except Exception as error:  # whatever another's code raises
-                values[name] = None
-                notes.append(f"no {name}: {' '.join(str(error).split())}")
-        return values
 
     def _flicker(
         self, job: Job, pair: Pair, light: tuple[Tensor, Tensor], metric: VDM, notes: list[str]
