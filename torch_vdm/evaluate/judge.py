@@ -152,7 +152,9 @@ class Judge:
         found = [self._map(metric, pair.test, pair.reference) for pair in pairs]
         seconds = time.perf_counter() - start
         jnd = torch.stack(found).amax(0) if len(found) > 1 else found[0]
-        pair = max(zip(found, pairs, strict=True), key=lambda both: both[0].max().item())[1]
+        maxima = [each.max().item() for each in found]
+        most = maxima.index(max(maxima))  # the pair that shows most
+        pair = pairs[most]
         light = _light(pair.reference, pair.display), _light(pair.test, pair.display)
         told = figures(jnd)
         values: dict[str, float | None] = {
@@ -167,7 +169,7 @@ class Judge:
         values |= others
         said = [*notes, *failed]
         if self.options.flicker and job.before:
-            values |= self._flicker(job, pair, light, metric, said)
+            values |= self._flicker(job, pairs[most], most, light, said)
         return _Judged(jnd, *light, pair, metric, values, said, seconds)
 
     def _metric(self, display: Display) -> VDM:
@@ -185,21 +187,29 @@ class Judge:
         return jnd
 
     def _flicker(
-        self, job: Job, pair: Pair, light: tuple[Tensor, Tensor], metric: VDM, notes: list[str]
+        self,
+        job: Job,
+        pair: Pair,
+        number: int,
+        light: tuple[Tensor, Tensor],
+        notes: list[str],
     ) -> dict[str, float | None]:
-        """Return the figures of flicker; a frame before that cannot be read is told of."""
+        """Return the figures of flicker of the pair of a number among a frame's pairs.
+
+        A frame before that cannot be read, or is of another kind, is told of.
+        """
         assert job.before is not None
         try:
             pairs, _ = self.bench.load(*job.before, self.options)
         except (ValueError, OSError) as error:
             notes.append(f"no flicker: {error}")
             return {}
-        before = [
-            _light(source, pairs[0].display) for source in (pairs[0].reference, pairs[0].test)
-        ]
-        if before[0].shape != light[0].shape or pairs[0].display.white != pair.display.white:
+        earlier = pairs[min(number, len(pairs) - 1)]
+        before = [_light(one, earlier.display) for one in (earlier.reference, earlier.test)]
+        if before[0].shape != light[0].shape or earlier.display.white != pair.display.white:
             notes.append("no flicker: the frame before is of another size or kind")
             return {}
+        metric = self._metric(pair.display)
         expected = flicker.with_error_of_before(*light, *before)
         expected = _pixels(expected, pair.display)
         told = figures(self._map(metric, pair.test, expected))

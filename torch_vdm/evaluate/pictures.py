@@ -76,7 +76,7 @@ def write_map(folder: Path, jnd: Tensor) -> str:
     step = block((jnd.shape[0], jnd.shape[1]))
     if step > 1:
         jnd = functional.max_pool2d(jnd[None, None], step, ceil_mode=True)[0, 0]
-    whole = np.rint(jnd.double().numpy() * STEPS).astype(np.uint32)
+    whole = np.minimum(np.rint(jnd.double().numpy() * STEPS), 2**24 - 1).astype(np.uint32)
     planes = np.stack([whole >> 16, whole >> 8, whole]).astype(np.uint8)
     return _write(folder, "map", planes)
 
