@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torch_vdm.evaluate.statistics import FEWEST, compare, interval
+from torch_vdm.evaluate.statistics import FEWEST, Paired, compare, interval
 
 
 def pairs(one: list[float], other: list[float]) -> list[tuple[float, float]]:
@@ -19,7 +19,7 @@ def test_a_difference_is_said_in_words() -> None:
     assert told.interval[0] < told.median < told.interval[1] < 0.0
     low, high = -told.interval[1], -told.interval[0]
     assert told.sentence("Maximum") == (
-        f"Maximum: B is better than A, {low:.2g} to {high:.2g} JND less in the median, "
+        f"Maximum: B is better than A, {low:.1f} to {high:.1f} JND less in the median, "
         f"on {told.lower} of 50 frames."
     )
     turned = compare("B", "A", "max_jnd", pairs(other.tolist(), one.tolist()))
@@ -60,3 +60,13 @@ def test_drawings_of_many_frames_are_made_in_parts(monkeypatch: pytest.MonkeyPat
     whole = interval(values)
     monkeypatch.setattr("torch_vdm.evaluate.statistics.AT_ONCE", 5000)
     assert interval(values) == whole
+
+
+def test_ranges_have_the_same_digits() -> None:
+    def told(low: float, high: float) -> str:
+        return Paired("A", "B", "max_jnd", 9, low, (low, high), 4, 5).sentence("Maximum")
+
+    assert "0.28 to 0.30 JND less" in told(0.28, 0.3)
+    assert "12 to 140 JND less" in told(12.0, 140.0)
+    assert "-0.20 to +1.50 JND in the median" in told(-0.2, 1.5)
+    assert "+0.0 to +0.0 JND" in told(0.0, 0.0)

@@ -35,8 +35,9 @@ function drawn(tag, attributes, text) {
 function shown(figure, value) {
   if (value === null || value === undefined) return "–";
   const number = figure.percent ? value * 100 : value;
-  const sign = figure.name === "mean_luminance_change" && number > 0 ? "+" : "";
-  return sign + number.toFixed(figure.digits) + (figure.percent ? " %" : "");
+  const text = number.toFixed(figure.digits).replace(/^-(0\.?0*)$/, "$1");
+  const sign = figure.name === "mean_luminance_change" && Number(text) > 0 ? "+" : "";
+  return sign + text + (figure.percent ? " %" : "");
 }
 
 const plural = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;

@@ -1,5 +1,6 @@
 """Which of two tests is better, from the same frames of both."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -61,7 +62,7 @@ class Paired:
         if low <= 0.0 <= high:
             return (
                 f"{what}: no difference between {self.one} and {self.other} can be told, "
-                f"{_signed(low)} to {_signed(high)} JND in the median over {self.frames} frames "
+                f"{_range(low, high, '+')} JND in the median over {self.frames} frames "
                 f"({self.other} is lower on {self.lower}, {self.one} on {self.higher})."
             )
         better, worse, least, most, wins = (
@@ -70,7 +71,7 @@ class Paired:
             else (self.one, self.other, low, high, self.higher)
         )
         return (
-            f"{what}: {better} is better than {worse}, {_short(least)} to {_short(most)} JND less "
+            f"{what}: {better} is better than {worse}, {_range(least, most)} JND less "
             f"in the median, on {wins} of {self.frames} frames."
         )
 
@@ -125,10 +126,8 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-def _short(value: float) -> str:
-    """Return a number with two digits that count, three from 100 on."""
-    return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.2g}"
-
-
-def _signed(value: float) -> str:
-    return "0" if value == 0.0 else f"{'+' if value > 0.0 else '-'}{_short(abs(value))}"
+def _range(low: float, high: float, sign: str = "") -> str:
+    """Return a range of numbers with as many digits as tell two of the smaller one's."""
+    smallest = min((abs(end) for end in (low, high) if end), default=1.0)
+    digits = max(0, 1 - math.floor(math.log10(smallest)))
+    return f"{low:{sign}.{digits}f} to {high:{sign}.{digits}f}"
