@@ -67,6 +67,7 @@ def test_everything_is_written_and_said(folders: Path, capsys: pytest.CaptureFix
     assert len(told["frames"]) == 2 * FRAMES
     assert told["settings"]["accuracy"] == "standard"
     assert told["settings"]["ppd"] == 60.0
+    assert told["settings"]["tests"] == f"A={folders}/a, B={folders}/b"
     assert told["summary"]["tests"]["A"]["compared"] == FRAMES
     first = told["frames"][0]
     assert (first["frame"], first["test"], first["size"]) == ("000", "A", [32, 24])

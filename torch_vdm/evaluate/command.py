@@ -122,7 +122,14 @@ def run(options: argparse.Namespace, bench: Bench, assumptions: Sequence[str]) -
     compared = _compared(matched.tests, results)
     summary = _summary(matched.tests, results, options.fail_above)
     output: Path = options.output
-    told = {"version": __version__, **settings(options), "fail_above": options.fail_above}
+    told = {
+        "version": __version__,
+        "reference": options.reference,
+        "tests": ", ".join(f"{name}={place}" for name, place in options.test or ()),
+        "manifest": None if options.manifest is None else str(options.manifest),
+        "fail_above": options.fail_above,
+        **settings(options),
+    }
     tables.write_json(output / RESULTS, told, summary, compared, results)
     tables.write_csv(output / TABLE, results)
     if options.parquet:
@@ -209,12 +216,7 @@ def _worked_through(
                 results[key] = result
                 advance()
         except KeyboardInterrupt:
-            kept = len(results) - len(matched.missing)
-            print(
-                f"{kept} of {counted(len(matched.jobs), 'comparison')} kept in {options.output}; "
-                "--resume goes on",
-                file=sys.stderr,
-            )
+            print(f"what is done is kept in {options.output}; --resume goes on", file=sys.stderr)
             raise
     place = {test: number for number, test in enumerate(matched.tests)}
     return [

@@ -46,7 +46,9 @@ def write(
         "rows": [_row(result, tests, names) for result in results if not result.skipped],
         "skipped": [[r.frame, r.test, r.skipped] for r in results if r.skipped],
         "sentences": list(sentences),
-        "settings": [[name, str(value)] for name, value in settings.items() if value is not None],
+        "settings": [
+            [name, str(value)] for name, value in settings.items() if value not in (None, "")
+        ],
         "assumptions": list(assumptions),
         "fail_above": settings.get("fail_above"),
         "borders": maps.BORDERS,
