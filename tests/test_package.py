@@ -9,8 +9,10 @@ from benchmarks.places import ROOT
 
 
 def test_heavy_packages_are_imported_where_they_are_used() -> None:
-    heavy = ("kornia", "matplotlib", "OpenEXR", "PIL", "rich", "tifffile", "torchmetrics")
-    heavy += ("torch._dynamo",)
+    heavy = {
+        *("kornia", "matplotlib", "OpenEXR", "PIL", "rich", "tifffile", "torchmetrics"),
+        "torch._dynamo",
+    }
     code = f"import sys, torch_vdm; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     assert done.stdout.decode().strip() == "[]"

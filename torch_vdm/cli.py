@@ -22,7 +22,10 @@ from torch import Tensor
 
 from torch_vdm import __version__
 from torch_vdm.cortex import Haar, StationaryHaar, Steerable, Transform
-from torch_vdm.display import pixels_per_degree
+from torch_vdm.display import Display, pixels_per_degree
+from torch_vdm.evaluate import command as evaluation
+from torch_vdm.evaluate.frames import EvaluationError
+from torch_vdm.evaluate.judge import Bench
 from torch_vdm.io import ImageError, atomic_path, check_target, write_image
 from torch_vdm.io.alpha import colour
 from torch_vdm.io.refusal import printable
@@ -158,6 +161,8 @@ def _usage() -> Iterator[None]:
 
 
 def _command(options: argparse.Namespace) -> int:
+    if options.command == "evaluate":
+        return _evaluate(options)
     if options.command == "demo":
         sample = files("torch_vdm") / "sample"
         with as_file(sample / "reference.exr") as one, as_file(sample / "test.exr") as other:
@@ -188,11 +193,24 @@ def _parser() -> argparse.ArgumentParser:
         "with the package.",
     )
     for command in (compare, demo):
-        _add_options(command, Path("torch-vdm-demo.png") if command is demo else None)
+        _add_options(command)
+        _add_output(command, Path("torch-vdm-demo.png") if command is demo else None)
+    many = commands.add_parser(
+        "evaluate",
+        help="compare many frames of several tests, and report",
+        description="Compare the frames of one or more tests with those of a reference, and write "
+        "a report, tables and maps. Exit status: 0 done, 1 --fail-above exceeded, 2 bad input, "
+        "130 interrupted.",
+    )
+    evaluation.add_arguments(many)
+    _add_options(many)
+    many.add_argument(
+        "--fail-above", type=_jnd, metavar="JND", help="exit with 1 where a maximum is larger"
+    )
     return parser
 
 
-def _add_options(parser: argparse.ArgumentParser, map_path: Path | None) -> None:
+def _add_options(parser: argparse.ArgumentParser) -> None:
     view = parser.add_argument_group("viewing")
     view.add_argument("--ppd", type=positive, metavar="F", help=f"pixels per degree ({PPD:g})")
     view.add_argument(
@@ -271,6 +289,9 @@ def _add_options(parser: argparse.ArgumentParser, map_path: Path | None) -> None
         default="raise",
         help="negative light in the file: refused (default), 0, or kept",
     )
+
+
+def _add_output(parser: argparse.ArgumentParser, map_path: Path | None) -> None:
     output = parser.add_argument_group("output")
     output.add_argument(
         "--map", type=_map_path, default=map_path, metavar="OUT.png|OUT.exr", help="the heat map"
@@ -279,6 +300,34 @@ def _add_options(parser: argparse.ArgumentParser, map_path: Path | None) -> None
     output.add_argument(
         "--fail-above", type=_jnd, metavar="JND", help="exit with 1 where the maximum is larger"
     )
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    options.accuracy = options.accuracy or ACCURACY[options.observer]
+    with _usage():
+        options.ppd, seen_from = _viewing(options)
+    # Said once, as pixels per degree: the same view is then the same setting.
+    options.screen = options.diagonal = options.distance = None
+    assumptions = [seen_from]
+    if options.accuracy == "fast" and options.observer == "calibrated":
+        assumptions.append(MAY_MISS)
+    try:
+        outcome = evaluation.run(options, Bench(_pairs, _metric, LARGEST_WHOLE), assumptions)
+    except EvaluationError as error:
+        raise UsageError(str(error)) from error
+    tell(outcome.text)
+    return EXCEEDED if outcome.exceeded else DONE
+
+
+def _pairs(
+    reference: Path, test: Path, options: argparse.Namespace
+) -> tuple[Sequence[Pair], Sequence[str]]:
+    return load_pairs(reference, test, displays_of(options), options)
+
+
+def _metric(display: Display, options: argparse.Namespace) -> VDM:
+    transform = TRANSFORMS[options.accuracy]()
+    return VDM(options.ppd, display, OBSERVERS[options.observer](), transform)
 
 
 def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:

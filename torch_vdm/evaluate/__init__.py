@@ -1,0 +1,1 @@
+"""Many frames of several tests beside their reference: figures, comparisons, a report."""

@@ -1,0 +1,133 @@
+"""Pictures beside the page, which keep values: the page reads numbers, not colours.
+
+A browser hides the pixels of a picture file from a page that was opened from a disk, and may change
+their colours. So each picture is a script that calls ``picture(name, width, height, kind, data)``:
+base64 of deflated planes of bytes, each byte the difference to the one at its left, modulo 256.
+
+=======  ======================================================================
+kind     planes of (height, width)
+=======  ======================================================================
+coded    R, G, B, sRGB-coded
+light    R, G, B and a common exponent e: the light is R * 2^(e - 136), 1.0 is white
+map      hundredths of a JND as a whole number, its high, middle and low byte
+=======  ======================================================================
+"""
+
+import base64
+import hashlib
+import zlib
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from torch_vdm.display import encode_srgb
+from torch_vdm.io import atomic_path
+
+# A side of a picture that the page shows, in pixels; larger images are shown by blocks of pixels.
+# A browser's canvas takes more, but not much. Status: choice.
+LARGEST_SIDE = 4096
+
+# Sides of the small pictures of maps, in pixels. Status: choice.
+THUMBNAIL = 320
+
+# What a map's colours are cut at where the largest difference is smaller, in JND. Status: choice;
+# the same as in the heat map of `torch_vdm.report`.
+SMALLEST_SCALE = 2.0
+
+# Hundredths of a JND: what the page prints. Status: choice.
+STEPS = 100
+
+
+Bytes = NDArray[np.uint8]
+
+
+def block(size: tuple[int, int]) -> int:
+    """Return the side of the blocks of pixels by which an image (height, width) is shown."""
+    return -(-max(size) // LARGEST_SIDE)
+
+
+def write_image(folder: Path, light: Tensor, coded: bool) -> str:
+    """Write a picture of an image and return its name.
+
+    Parameters
+    ----------
+    folder
+        Where to.
+    light
+        (3, H, W), linear, 1.0 is white; light below 0 is shown as 0.
+    coded
+        Whether 8 bits of sRGB hold it: it came from such a file.
+    """
+    step = block((light.shape[-2], light.shape[-1]))
+    if step > 1:
+        light = functional.avg_pool2d(light[None], step, ceil_mode=True, count_include_pad=False)[0]
+    if coded:
+        planes = encode_srgb(light).clamp(0.0, 1.0).mul(255.0).round().to(torch.uint8).numpy()
+        return _write(folder, "coded", planes)
+    return _write(folder, "light", _with_common_exponent(light.numpy()))
+
+
+def write_map(folder: Path, jnd: Tensor) -> str:
+    """Write a picture of a map (H, W) in JND and return its name; a block shows its maximum."""
+    step = block((jnd.shape[0], jnd.shape[1]))
+    if step > 1:
+        jnd = functional.max_pool2d(jnd[None, None], step, ceil_mode=True)[0, 0]
+    whole = np.minimum(np.rint(jnd.double().numpy() * STEPS), 2**24 - 1).astype(np.uint32)
+    planes = np.stack([whole >> 16, whole >> 8, whole]).astype(np.uint8)
+    return _write(folder, "map", planes)
+
+
+def write_thumbnail(path: Path, jnd: Tensor) -> None:
+    """Draw a map (H, W) as a small PNG in its colours; a block of pixels shows its maximum."""
+    import PIL.Image
+
+    step = -(-max(jnd.shape) // THUMBNAIL)
+    small = functional.max_pool2d(jnd[None, None], step, ceil_mode=True)[0, 0]
+    top = max(SMALLEST_SCALE, small.max().item())
+    picture = PIL.Image.fromarray((small / top * 255.0).round().to(torch.uint8).numpy())
+    picture.putpalette(palette().tobytes())
+    with atomic_path(path) as temporary:
+        picture.save(temporary, "PNG")
+
+
+def palette() -> Bytes:
+    """Return the colours of a map from 0 to the top of its scale, (256, 3)."""
+    from matplotlib import colormaps
+
+    colours: Bytes = colormaps["inferno"](np.arange(256), bytes=True)[:, :3]
+    return np.ascontiguousarray(colours)
+
+
+def path_of(folder: Path, name: str) -> Path:
+    """Return the file of a picture."""
+    return folder / f"{name}.js"
+
+
+def _with_common_exponent(light: NDArray[np.float32]) -> Bytes:
+    """Return bytes of R, G, B and their exponent (4, H, W): Radiance's RGBE, value for value."""
+    light = np.maximum(light, 0.0)
+    _, exponent = np.frexp(light.max(0))
+    exponent = np.clip(exponent, -127, 127)
+    mantissas = np.minimum(np.rint(np.ldexp(light, 8 - exponent)), 255.0)
+    return np.concatenate([mantissas, exponent[None] + 128]).astype(np.uint8)
+
+
+def _write(folder: Path, kind: str, planes: Bytes) -> str:
+    """Write planes under a name that follows from their content: once, however often asked."""
+    name = hashlib.sha256(repr((kind, planes.shape)).encode() + planes.tobytes()).hexdigest()[:24]
+    path = path_of(folder, name)
+    if not path.exists():
+        steps = planes.copy()
+        steps[..., 1:] -= planes[..., :-1]
+        # Runs and frequent bytes are all that there is to find in noise, and are found quickly.
+        packer = zlib.compressobj(1, strategy=zlib.Z_RLE)
+        packed = packer.compress(steps.tobytes()) + packer.flush()
+        text = base64.b64encode(packed).decode()
+        height, width = planes.shape[1:]
+        with atomic_path(path) as temporary:
+            temporary.write_text(f'picture("{name}",{width},{height},"{kind}","{text}")\n')
+    return name

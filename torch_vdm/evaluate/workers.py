@@ -1,0 +1,156 @@
+"""Jobs worked through by several processes, any of which may die."""
+
+import signal
+import threading
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from typing import NamedTuple
+
+import torch
+
+from torch_vdm.evaluate.frames import Job
+from torch_vdm.evaluate.journal import Result
+from torch_vdm.evaluate.judge import Judge
+from torch_vdm.io.refusal import printable
+
+Known = Mapping[tuple[str, str], Result]
+
+
+class _Hand(NamedTuple):
+    """A process, and what it was given to do."""
+
+    process: SpawnProcess
+    job: Job
+
+
+def results(
+    judge: Judge, jobs: Sequence[Job], known: Known, count: int
+) -> Generator[Result, None, None]:
+    """Yield the results of jobs as they come.
+
+    Parameters
+    ----------
+    judge
+        What does a job; it is sent to each process.
+    jobs
+        What to do.
+    known
+        Results of an earlier run, which stand where files and settings are the same.
+    count
+        Number of processes; 1 works in this one. They share its threads. One that dies has its job
+        told as skipped, and another takes its place.
+
+    Raises
+    ------
+    Exception
+        What ``judge`` raises, as it comes.
+    """
+    if count == 1 or len(jobs) < 2:
+        for job in jobs:
+            yield judge(job, known.get((job.frame, job.test)))
+        return
+    count = min(count, len(jobs))
+    threads = max(1, torch.get_num_threads() // count)
+    waiting = iter(jobs)
+    hands: dict[Connection, _Hand] = {}
+    try:
+        for _, job in zip(range(count), waiting, strict=False):
+            _start(hands, judge, threads, job, known)
+        while hands:
+            for connection in wait(list(hands)):
+                assert isinstance(connection, Connection)
+                hand = hands.pop(connection)
+                try:
+                    answer = connection.recv()
+                except (EOFError, OSError):
+                    yield _died(connection, hand)
+                    following = next(waiting, None)
+                    if following:
+                        _start(hands, judge, threads, following, known)
+                    continue
+                following = next(waiting, None)
+                if following:
+                    hands[connection] = _Hand(hand.process, following)
+                    _give(connection, following, known)
+                else:
+                    _end(connection, hand)
+                if isinstance(answer, Exception):
+                    raise answer
+                yield answer
+    finally:
+        for connection, hand in hands.items():
+            hand.process.terminate()
+            _end(connection, hand)
+
+
+def _start(
+    hands: dict[Connection, _Hand], judge: Judge, threads: int, job: Job, known: Known
+) -> None:
+    """Start a process on a job."""
+    context = get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_work, args=(theirs, judge, threads), daemon=True)
+    with _no_interrupts():
+        process.start()
+    theirs.close()
+    hands[ours] = _Hand(process, job)
+    _give(ours, job, known)
+
+
+def _give(connection: Connection, job: Job, known: Known) -> None:
+    # That the process died is seen where its answer is awaited.
+    with suppress(BrokenPipeError, ConnectionResetError):
+        connection.send((job, known.get((job.frame, job.test))))
+
+
+def _end(connection: Connection, hand: _Hand) -> None:
+    """Let a process end and forget it."""
+    connection.close()
+    hand.process.join()
+    hand.process.close()
+
+
+def _died(connection: Connection, hand: _Hand) -> Result:
+    """Return the result of a job whose process died."""
+    hand.process.join()
+    why = (
+        f"{hand.job.path}: the process that compared it died (exit code {hand.process.exitcode}); "
+        "give it more memory, or use fewer --jobs"
+    )
+    _end(connection, hand)
+    return Result(frame=hand.job.frame, test=hand.job.test, skipped=printable(why))
+
+
+@contextmanager
+def _no_interrupts() -> Iterator[None]:
+    """Let processes that are started here never see Ctrl-C, which is this process's to answer."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _work(connection: Connection, judge: Judge, threads: int) -> None:
+    """Do jobs until there are no more, or nobody is there to take the results."""
+    torch.set_num_threads(threads)
+    while True:
+        try:
+            job, known = connection.recv()
+        except (EOFError, OSError):
+            return
+        answer: Result | Exception
+        try:
+            answer = judge(job, known)
+        except Exception as error:  # the other process tells of it
+            answer = error
+        try:
+            connection.send(answer)
+        except (BrokenPipeError, ConnectionResetError):
+            return
