@@ -342,9 +342,9 @@ def test_the_stop_is_honest(observer: Observer) -> None:
             base = np.full((16, 16, 3), 0.2)
             light = np.full((16, 16, 3), event)
             renderer = Synthetic(base, light, np.full((16, 16), chance), seed)
-            sampler = Sampler(renderer.size, metric, Settings(tolerance=3.0))
+            sampler = Sampler(renderer.size, metric, Settings(tolerance=2.0))
             assert finished(sampler, renderer)[-1].converged
-            ratios.append(true_maximum(sampler.image, renderer.mean, metric) / 3.0)
+            ratios.append(true_maximum(sampler.image, renderer.mean, metric) / 2.0)
     assert sum(ratio <= 1.0 for ratio in ratios) >= 20
     assert 0.6 <= np.median(ratios) <= 0.95
 

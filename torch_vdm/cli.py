@@ -327,7 +327,10 @@ def _pairs(
 
 def _metric(display: Display, options: argparse.Namespace) -> VDM:
     transform = TRANSFORMS[options.accuracy]()
-    return VDM(options.ppd, display, OBSERVERS[options.observer](), transform)
+    metric = VDM(options.ppd, display, OBSERVERS[options.observer](), transform)
+    # A file says what its values are: codes beyond [0, 1] are colours that sRGB lacks.
+    metric._range_is_known = True
+    return metric
 
 
 def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
@@ -341,13 +344,12 @@ def _compare_with(
 ) -> int:
     check_outputs((reference, test), (options.map, json_path(options)))
     with _usage():
-        ppd, seen_from = _viewing(options)
+        options.ppd, seen_from = _viewing(options)
         displays = displays_of(options)
     options.accuracy = options.accuracy or ACCURACY[options.observer]
     pairs, assumptions = load_pairs(reference, test, displays, options)
     with _usage():
-        transform = TRANSFORMS[options.accuracy]()
-        metric = VDM(ppd, pairs[0].display, OBSERVERS[options.observer](), transform)
+        metric = _metric(pairs[0].display, options)
     tile = options.tile
     if tile is None and math.prod(pairs[0].size) > LARGEST_WHOLE:
         tile = TILE
@@ -365,14 +367,14 @@ def _compare_with(
         mean_luminance_change=luminances[1] / luminances[0] - 1.0 if luminances[0] > 0.0 else None,
         width=jnd.shape[1],
         height=jnd.shape[0],
-        ppd=ppd,
+        ppd=options.ppd,
         accuracy=options.accuracy,
         observer=options.observer,
         effects=metric.effects.names(),
         seconds=seconds,
         assumptions=assumptions,
         version=__version__,
-        reproduce=_reproduce(reference, test, ppd, tile, options),
+        reproduce=_reproduce(reference, test, tile, options),
     )
     if options.map is not None and options.map.suffix.lower() == ".exr":
         write_image(options.map, jnd)
@@ -489,12 +491,11 @@ def _viewing(options: argparse.Namespace) -> tuple[float, str]:
     return PPD, f"{PPD:g} pixels per degree, for nothing was given (--ppd)"
 
 
-def _reproduce(
-    reference: Path, test: Path, ppd: float, tile: int | None, options: argparse.Namespace
-) -> str:
+def _reproduce(reference: Path, test: Path, tile: int | None, options: argparse.Namespace) -> str:
     """Return the command that gives the same figures, with nothing left to defaults."""
     words = ["torch-vdm", "compare", str(reference), str(test)]
-    words += ["--ppd", repr(ppd), "--peak", repr(options.peak), "--white", repr(options.white)]
+    words += ["--ppd", repr(options.ppd), "--peak", repr(options.peak)]
+    words += ["--white", repr(options.white)]
     words += ["--exposure", repr(options.exposure), "--accuracy", options.accuracy]
     words += ["--observer", options.observer, "--nonfinite", options.nonfinite]
     words += ["--negative", options.negative]
