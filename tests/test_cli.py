@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import PIL.Image
 import pytest
 import torch
@@ -422,6 +423,37 @@ def test_both_eyes_are_compared(
     only = run_json(capsys, *paths, "--part", "right")
     assert told["max_jnd"] == pytest.approx(only["max_jnd"], abs=1e-5)
     assert float(str(only["max_jnd"])) > 1.0
+
+
+def write_eyes(path: Path, eyes: dict[str, torch.Tensor]) -> str:
+    """Write an OpenEXR file of a part for each view, in this order."""
+    parts = []
+    for view, planes in eyes.items():
+        header = {"type": OpenEXR.scanlineimage, "view": view}
+        parts.append(OpenEXR.Part(header, rgb(planes.numpy().copy()), view))
+    OpenEXR.File(parts).write(str(path))
+    return str(path)
+
+
+def test_eyes_are_matched_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    left, right = torch.rand(2, 3, 16, 24, generator=torch.Generator().manual_seed(1))
+    one = write_eyes(tmp_path / "one.exr", {"left": left, "right": right})
+    swapped = write_eyes(tmp_path / "swapped.exr", {"right": right, "left": left})
+    assert run_json(capsys, one, swapped)["max_jnd"] == 0.0
+    broken = write_eyes(tmp_path / "broken.exr", {"right": right, "left": left * 1.1})
+    plain = write_eyes(tmp_path / "plain.exr", {"left": left * 1.1, "right": right})
+    found = float(str(run_json(capsys, one, broken)["max_jnd"]))
+    assert found == run_json(capsys, one, plain)["max_jnd"]
+    assert found > 1.0
+    three = {"centre": left * 2, "right": right, "left": left}
+    more = run_json(capsys, one, write_eyes(tmp_path / "more.exr", three))
+    assert more["max_jnd"] == 0.0
+    lacking = "more.exr: the other file lacks its views centre: left out"
+    assert lacking in str(more["assumptions"])
+    centre = write_eyes(tmp_path / "centre.exr", {"centre": left})
+    line = one_line_error(capsys, "compare", one, centre)
+    assert "expected a view that" in line
+    assert "(left, right), got centre; render the same views" in line
 
 
 def test_channels_are_named_on_the_command_line(

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch_vdm.display import BT709_TO_XYZ, Display, decode_srgb, encode_srgb
 from torch_vdm.io import ArrayFile, Image, ImageError, load
 from torch_vdm.io.arrays import MAGIC
+from torch_vdm.io.exr_header import listed
 from torch_vdm.report import BAND, shrunk
 from torch_vdm.tiling import Source, read
 
@@ -132,19 +133,16 @@ def load_pairs(
     then no single background shows all of the difference.
     """
     paths = reference, test
-    images = [_open(path, options) for path in paths]
-    _require_one_size(images, images[0], paths)
-    assumptions = [*_scales(images, options)]
-    views = _views(images)
-    if len(views) > 1:
-        assumptions.append(
-            f"the views {' and '.join(views)} are compared: each pixel has the larger difference"
-        )
-    groups = [images]
-    for view in views[1:]:
-        groups.append([_open(path, options, view) for path in paths])
-        _require_one_size(groups[-1], images[0], paths)
+    opened = [_open(path, options) for path in paths]
+    views, told = _common_views(opened, paths)
     shown: list[str | None] = [*views] or [None]
+    groups = [
+        [_in_view(image, path, options, view) for image, path in zip(opened, paths, strict=True)]
+        for view in shown
+    ]
+    for group in groups:
+        _require_one_size(group, groups[0][0], paths)
+    assumptions = [*_scales(groups[0], options), *told]
     differ = [view for view, group in zip(shown, groups, strict=True) if _differ(group)]
     if differ:
         assumptions.append(f"the transparency of the two differs: {_over(options)}")
@@ -211,10 +209,36 @@ def _names(paths: Sequence[Path]) -> list[str]:
     )
 
 
-def _views(images: Sequence[_Opened]) -> list[str]:
-    """The views that both files have, if they have the same ones; else none."""
+def _common_views(images: Sequence[_Opened], paths: Sequence[Path]) -> tuple[list[str], list[str]]:
+    """The views to compare, by their names, and what is to be told of them.
+
+    None where a file has no views: then what each shows first is compared.
+    """
     one, other = (image.image.views if image.image else () for image in images)
-    return list(one) if set(one) == set(other) else []
+    if not one or not other:
+        return [], []
+    common = [view for view in one if view in other]
+    if not common:
+        raise ImageError(
+            f"{paths[1]}: expected a view that {paths[0]} has ({listed([*one])}), got "
+            f"{listed([*other])}; render the same views, or name the channels with --channels"
+        )
+    told = []
+    if len(common) > 1:
+        told.append(
+            f"the views {' and '.join(common)} are compared: each pixel has the larger difference"
+        )
+    for name, views in zip(_names(paths), (one, other), strict=True):
+        alone = [view for view in views if view not in common]
+        if alone:
+            told.append(f"{name}: the other file lacks its views {listed(alone)}: left out")
+    return common, told
+
+
+def _in_view(opened: _Opened, path: Path, options: argparse.Namespace, view: str | None) -> _Opened:
+    """Return what was opened, which is the first view of its file, or open another view of it."""
+    first = opened.image.views[:1] if opened.image else ()
+    return opened if view is None or view in first else _open(path, options, view)
 
 
 def _differ(images: Sequence[_Opened]) -> bool:
