@@ -350,6 +350,28 @@ def test_what_is_no_profile_is_refused(tmp_path: Path, data: bytes) -> None:
     assert "its colour profile cannot be used" in refusal(path)
 
 
+def test_a_profile_that_cannot_be_unpacked_is_refused(tmp_path: Path) -> None:
+    whole = iccp(profile(table(srgb_light, 16), PRIMARIES["P3"]))
+    body = whole[8:-4]
+    for place in (20, 40):
+        damaged = chunk(b"iCCP", body[:place] + bytes(20) + body[place + 20 :])
+        path = write(tmp_path / "image.png", damaged)
+        assert "its colour profile cannot be used" in refusal(path)
+    # cICP comes before it.
+    assert load(write(tmp_path / "image.png", cicp(1, 13, 0, 1), damaged)).kind == "coded"
+
+
+@pytest.mark.parametrize("number", [0, 2])
+def test_a_jpeg_that_lacks_pieces_of_its_profile_is_refused(tmp_path: Path, number: int) -> None:
+    path = tmp_path / "image.jpg"
+    data = profile(table(srgb_light, 16), PRIMARIES["P3"])
+    PIL.Image.new("RGB", (4, 4)).save(path, icc_profile=data)
+    stored = bytearray(path.read_bytes())
+    stored[stored.index(b"ICC_PROFILE\0") + 13] = number  # of how many pieces
+    path.write_bytes(stored)
+    assert "its colour profile cannot be used" in refusal(path)
+
+
 # --- gAMA and cHRM, and what wins -----------------------------------------------------------------
 
 

@@ -6,8 +6,8 @@ has 8 bits a channel and no colours outside sRGB. Those made of tables go throug
 
 import io
 import struct
-from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -68,6 +68,22 @@ def read_profile(data: bytes) -> Profile:
         return _read_profile(data)
     except (struct.error, IndexError, ZeroDivisionError) as error:
         raise _damaged(str(error)) from error
+
+
+def stated(info: Mapping[Any, object]) -> bytes | None:
+    """The profile in what Pillow tells of a file; None where the file has none.
+
+    Raises
+    ------
+    ImageError
+        If the file has one that Pillow could not put together.
+    """
+    profile = info.get("icc_profile")
+    if isinstance(profile, bytes) and profile:
+        return profile
+    if "icc_profile" in info:
+        raise _damaged("it is empty, cut off, or cannot be unpacked")
+    return None
 
 
 def through_lcms(codes: Floats, data: bytes) -> Floats:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_vdm.io import alpha
+from torch_vdm.io import alpha, icc
 from torch_vdm.io.colour import SRGB, VIDEO, Colour, shown
 from torch_vdm.io.decoded import Decoded
 from torch_vdm.io.primaries import Chromaticities
@@ -60,13 +60,12 @@ def load_picture(
             turn = orientation(image)  # a TIFF's is gone once it is loaded, and the image turned
             image.load()
             values = _values(image, content == "TGA" and not _tga_has_alpha(data))
-            profile = image.info.get("icc_profile")
+            profile = icc.stated(image.info)
     except (ImageError, MemoryError):
         raise
     except Exception as error:
         # The decoders raise about every class there is when a file is damaged.
         raise ImageError(f"damaged {content} ({error}); export it again") from error
-    profile = profile if isinstance(profile, bytes) and profile else None
     colour = Colour(profile=profile, chromaticities=chromaticities)
     if content == "JPEG" and profile is None and _is_adobe_rgb(image):
         colour = Colour(gamma=ADOBE_GAMMA, chromaticities=ADOBE_RGB)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_vdm.io import icc
 from torch_vdm.io.colour import Colour, check_cicp
 from torch_vdm.io.decoded import Decoded
 from torch_vdm.io.pictures import decoded, orientation
@@ -102,12 +103,13 @@ def _colour(data: bytes, image: "PngImageFile") -> Colour:
     cicp = None if stored is None else struct.unpack(">4B", stored)
     if cicp is not None:
         check_cicp(cicp)
-    profile = image.info.get("icc_profile")
+    # A profile that cICP overrules may be damaged.
+    profile = icc.stated(image.info) if cicp is None else None
     gamma = image.info.get("gamma")
     stated = image.info.get("chromaticity")  # white first
     return Colour(
         cicp,
-        profile if isinstance(profile, bytes) else None,
+        profile,
         "srgb" in image.info,
         float(gamma) if isinstance(gamma, float) else None,
         (*stated[2:], *stated[:2]) if isinstance(stated, tuple) and len(stated) == 8 else None,

@@ -52,7 +52,7 @@ def load_tiff(data: bytes, repair: Repair, coded: bool, notes: list[str]) -> Dec
                 return load_picture(data, "TIFF", notes, chromaticities)
             _check(page)
             values = _values(page)
-            profile = _tag(page, PROFILE)
+            profile = _profile(page)
             turn = _tag(page, ORIENTATION)
             associated = ASSOCIATED in page.extrasamples
     except (ImageError, MemoryError):
@@ -61,7 +61,6 @@ def load_tiff(data: bytes, repair: Repair, coded: bool, notes: list[str]) -> Dec
         # The decoder raises about every class there is when a file is damaged.
         raise ImageError(f"damaged TIFF ({error}); export it again") from error
     turn = turn if isinstance(turn, int) and 1 <= turn <= 8 else 1
-    profile = profile if isinstance(profile, bytes) else None
     if values.dtype.kind == "f":
         colour = Colour(profile=profile, chromaticities=chromaticities)
         return _floats(turned(values, turn, notes), colour, associated, repair, coded, notes)
@@ -187,6 +186,10 @@ def _chromaticities(page: "TiffPage") -> Chromaticities | None:
     with np.errstate(all="ignore"):
         fractions = numbers[:, 0] / numbers[:, 1]
     return (*map(float, fractions), *(() if white else BT709[6:]))
+
+
+def _profile(page: "TiffPage") -> bytes | None:
+    return icc.stated({"icc_profile": _tag(page, PROFILE)} if PROFILE in page.tags else {})
 
 
 def _tag(page: "TiffPage", number: int) -> object:
