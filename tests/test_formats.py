@@ -197,6 +197,13 @@ def test_radiance_that_is_refused(tmp_path: Path, size: str, header: str, words:
 # --- PFM and PNM ----------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("more", [b"\n", b"#?RADIANCE\n"])
+def test_radiance_that_goes_on_is_refused(tmp_path: Path, more: bytes) -> None:
+    path = tmp_path / "image.hdr"
+    write_hdr(path, rgbe(light(2, 9)).tobytes() + more, "-Y 2 +X 9")
+    assert f"got {len(more)} bytes more; write each picture" in refusal(path)
+
+
 @given(
     order=st.sampled_from("<>"),
     grey=st.booleans(),
@@ -241,6 +248,20 @@ def test_pfm_values_are_judged(tmp_path: Path) -> None:
         (b"P6\n2 2\n99999\n" + bytes(48), "its white is 99999"),
         (b"P6\n2 2\n255\n" + bytes(11), "incomplete: 11 of 12 bytes"),
         (b"P6\n2\n", "its header cannot be read"),
+        # What goes on after its pixels: more pictures, or a header that was misread.
+        (2 * (b"PF\n2 2\n-1\n" + bytes(48)), "expected 48 bytes of pixels, got 106"),
+        (b"PF\n2 2\n-1\n" + bytes(49), "expected 48 bytes of pixels, got 49"),
+        (2 * (b"P6\n2 2\n255\n" + bytes(12)), "write each picture to a file of its own"),
+        (b"P5\n2 2\n255\n" + bytes(5), "expected 4 bytes of pixels, got 5"),
+        (b"P4\n9 2\n" + bytes(5), "expected 4 bytes of pixels, got 5"),
+        (b"P4\n9 2\n" + bytes(3), "incomplete: 3 of 4 bytes"),
+        (b"P1\n2 1\n1 0 1\n", "expected 2 numbers, got 3"),
+        (b"P2\n2 1\n255\n1 2 P2", "its pixels are no numbers"),
+        (b"P2\n2 1\n255\n1", "incomplete: 1 of 2 numbers"),
+        (b"P2\n2 1\n255\n", "incomplete: 0 of 2 numbers"),
+        (b"P2\n2 1\n255\n1 256", "expected numbers up to 255, got 256"),
+        (b"P2\n2 1\n255\n1 " + 30 * b"9", "expected numbers up to 255, got"),
+        (b"P3\n60000 1000\n255\n1", "damaged: 60000 x 1000 pixels"),
     ],
 )
 def test_netpbm_that_is_refused(tmp_path: Path, data: bytes, words: str) -> None:
@@ -263,11 +284,52 @@ def test_pnm(white: int, grey: bool, tmp_path_factory: pytest.TempPathFactory) -
     assert image.kind == "coded"
 
 
-@pytest.mark.parametrize("text", ["P3\n2 1\n255\n255 0 51  0 255 0\n", "P2\n2 1\n255\n255 51\n"])
-def test_pnm_in_letters(tmp_path: Path, text: str) -> None:
-    (tmp_path / "image.ppm").write_text(text)
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("text", ["P3\n2 1\n255\n255 0 51  0 255 0\n", "P2\n2 1\n255\n255 51"])
+def test_pnm_in_letters(tmp_path: Path, text: str, end: str) -> None:
+    (tmp_path / "image.ppm").write_bytes(text.replace("\n", end).encode())
     expected = [[[1, 0]], [[0, 1]], [[0.2, 0]]] if "3" in text[:2] else [[[1, 0.2]]] * 3
     torch.testing.assert_close(read_image(tmp_path / "image.ppm"), torch.tensor(expected))
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_pnm_in_letters_keeps_16_bits(tmp_path: Path, samples: int) -> None:
+    values = np.random.default_rng(1).integers(0, 65536, (5, 4, samples))
+    path = tmp_path / "image.pnm"
+    numbers = "\n".join(map(str, values.ravel()))
+    path.write_text(f"P{3 if samples == 3 else 2}\n4 5 # width, height\n65535\n{numbers}\n")
+    image = load(path)
+    expected = np.broadcast_to(np.moveaxis(values, -1, 0) / 65535, (3, 5, 4))
+    np.testing.assert_allclose(image.pixels, expected, atol=1e-7)
+    assert image.notes[0] == "The channels have 16 bits."
+
+
+@pytest.mark.parametrize("width", [1, 8, 13])
+@pytest.mark.parametrize("spaces", ["", " "])
+def test_pbm(tmp_path: Path, width: int, spaces: str) -> None:
+    ink = np.random.default_rng(1).integers(0, 2, (5, width))
+    packed = np.packbits(ink.astype(np.uint8), axis=1).tobytes()
+    (tmp_path / "bits.pbm").write_bytes(b"P4\n%d 5\n" % width + packed)
+    digits = "\n".join(spaces.join(map(str, row)) for row in ink)
+    (tmp_path / "letters.pbm").write_text(f"P1\n# ink\n{width} 5\n{digits}\n")
+    for name in ("bits.pbm", "letters.pbm"):
+        expected = np.broadcast_to(1 - ink, (3, 5, width))
+        np.testing.assert_array_equal(read_image(tmp_path / name), expected)
+
+
+@pytest.mark.parametrize(
+    ("header", "size"),
+    [("PF\n4 5\n-1\n", 240), ("P6\n4 5\n255\n", 60), ("P4\n13 5\n", 10)],
+)
+def test_netpbm_with_the_lines_of_windows(tmp_path: Path, header: str, size: int) -> None:
+    # Bytes of every value, and no NaN among the floats.
+    pixels = (np.arange(size) % 100 + 1).astype(np.uint8).tobytes()
+    images = []
+    for end in ("\n", "\r\n"):
+        path = tmp_path / "image.ppm"
+        path.write_bytes(header.replace("\n", end).encode() + pixels)
+        images.append(read_image(path) if header[:2] != "PF" else load(path).pixels)
+    torch.testing.assert_close(*images, rtol=0, atol=0)
 
 
 # --- TIFF -----------------------------------------------------------------------------------------

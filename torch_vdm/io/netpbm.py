@@ -8,34 +8,72 @@ from numpy.typing import NDArray
 
 from torch_vdm.io.colour import Colour
 from torch_vdm.io.decoded import Decoded
-from torch_vdm.io.pictures import decoded, load_picture
+from torch_vdm.io.pictures import decoded
 from torch_vdm.io.refusal import ImageError, Repair, check_size, require_finite, without_negatives
 
 # The kind, and width, height and the largest value or the scale, with comments between.
 _SPACE = rb"(?:\s|#[^\n]*\n)+"
-_WHOLE = re.compile(rb"P([56])" + _SPACE + _SPACE.join([rb"(\d{1,9})"] * 3) + rb"\s")
+_BITS = re.compile(rb"P([14])" + 2 * (_SPACE + rb"(\d{1,9})") + rb"\s")
+_WHOLE = re.compile(rb"P([2356])" + 3 * (_SPACE + rb"(\d{1,9})") + rb"\s")
 _FLOAT = re.compile(rb"P([Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,30})\s")
 
 
 def load_pnm(data: bytes, notes: list[str]) -> Decoded:
     """Return the image of a PPM, PGM or PBM, of 8 or 16 bits; notes go to ``notes``."""
-    if data[1:2] not in (b"5", b"6"):
-        return load_picture(data, "PNM", notes)  # letters, and bits
-    found = _WHOLE.match(data)
+    bits = data[1:2] in (b"1", b"4")
+    found = (_BITS if bits else _WHOLE).match(data)
     if found is None:
         raise ImageError("damaged PNM: its header cannot be read; export it again")
-    width, height, white = (int(number) for number in found.groups()[1:])
+    kind, width, height, *last = (int(number) for number in found.groups())
+    white = last[0] if last else 1
     if not 0 < white < 65536:
         raise ImageError(f"damaged PNM: its white is {white}; export it again")
-    samples = 3 if found[1] == b"6" else 1
-    stored = np.dtype(">u2" if white > 255 else "u1")
-    values = _pixels(data, found.end(), (height, width, samples), stored).astype(np.uint32)
-    bits = 16 if white > 255 else 8
-    full = 2**bits - 1
-    scaled = (np.minimum(values, white) * full + white // 2) // white
-    if bits == 16:
+    shape = height, width, 3 if kind in (3, 6) else 1
+    if kind == 4:
+        values = _packed(data, found.end(), height, width)
+    elif kind < 4:
+        values = _written(data, found.end(), shape, white)
+    else:
+        values = _pixels(data, found.end(), shape, np.dtype(">u2" if white > 255 else "u1"))
+    if bits:
+        values = 1 - values  # 1 is ink
+    depth = 16 if white > 255 else 8
+    full = 2**depth - 1
+    scaled = (np.minimum(values.astype(np.uint32), white) * full + white // 2) // white
+    if depth == 16:
         notes.append("The channels have 16 bits.")
-    return decoded(scaled.astype(np.uint16 if bits == 16 else np.uint8), Colour(), 1, notes)
+    return decoded(scaled.astype(np.uint16 if depth == 16 else np.uint8), Colour(), 1, notes)
+
+
+def _packed(data: bytes, at: int, height: int, width: int) -> NDArray[Any]:
+    """Bits, of which every row begins with a byte of its own."""
+    check_size(width, height, height * width, len(data))
+    stored = _pixels(data, at, (height, -(-width // 8), 1), np.dtype("u1"))
+    return np.unpackbits(stored, axis=1)[:, :width]
+
+
+def _written(data: bytes, at: int, shape: tuple[int, int, int], white: int) -> NDArray[Any]:
+    """Numbers in letters; the digits of a PBM need no space between them."""
+    height, width, samples = shape
+    count = height * width * samples
+    check_size(width, height, 8 * count, len(data))
+    text = re.sub(rb"#[^\n]*", b"", data[at:])
+    values: NDArray[Any]
+    if re.search(rb"[^\d\s]", text):
+        raise ImageError("damaged PNM: its pixels are no numbers; export it again")
+    if data[1:2] == b"1":
+        values = np.frombuffer(text.translate(None, b" \t\n\v\f\r"), np.uint8) - ord("0")
+    else:
+        values = np.fromstring(text, np.int64, sep=" ") if text.strip() else np.empty(0, np.int64)
+    if len(values) < count:
+        raise ImageError(f"incomplete: {len(values)} of {count} numbers are there; copy it again")
+    if len(values) > count:
+        raise _too_much(f"{count} numbers", f"{len(values)}")
+    if values.max() > white:
+        raise ImageError(
+            f"damaged PNM: expected numbers up to {white}, got {values.max()}; export it again"
+        )
+    return values.reshape(shape)
 
 
 def load_pfm(data: bytes, repair: Repair, notes: list[str]) -> Decoded:
@@ -76,8 +114,19 @@ def _pixels(
     height, width, samples = shape
     size = height * width * samples * stored.itemsize
     check_size(width, height, size, len(data))
+    if len(data) == at + size + 1 and data[at - 1 : at + 1] == b"\r\n":
+        at += 1  # the line's end of a header that was written on Windows
     if at + size > len(data):
         raise ImageError(
             f"incomplete: {len(data) - at} of {size} bytes of pixels are there; copy it again"
         )
+    if at + size < len(data):
+        raise _too_much(f"{size} bytes of pixels", f"{len(data) - at}")
     return np.frombuffer(data, stored, height * width * samples, at).reshape(shape)
+
+
+def _too_much(expected: str, came: str) -> ImageError:
+    return ImageError(
+        f"expected {expected}, got {came}; write each picture to a file of its own, or export it "
+        "again"
+    )

@@ -36,7 +36,6 @@ READERS = {
     "BMP": ("PIL.BmpImagePlugin", "BmpImageFile", "Pillow"),
     "TGA": ("PIL.TgaImagePlugin", "TgaImageFile", "Pillow"),
     "TIFF": ("PIL.TiffImagePlugin", "TiffImageFile", "Pillow"),
-    "PNM": ("PIL.PpmImagePlugin", "PpmImageFile", "Pillow"),
     "AVIF": ("PIL.AvifImagePlugin", "AvifImageFile", "Pillow 11.3 or newer"),
 }
 

@@ -56,6 +56,11 @@ def _pixels(data: bytes, at: int, lines: int, length: int) -> NDArray[np.uint8]:
             at = _read_planes(data, at + 4, line)
         else:
             at = _read_old(data, at, line)
+    if at < len(data):
+        raise ImageError(
+            f"expected the file to end with its pixels, got {len(data) - at} bytes more; write "
+            "each picture to a file of its own, or export it again"
+        )
     return image
 
 
