@@ -34,11 +34,13 @@ def test_variances_are_those_of_a_linear_map(height: int, width: int, true_means
 def test_an_interior_node_has_a_sixteenth_of_its_children() -> None:
     variance = torch.rand(2, 3, 12, 12, dtype=torch.float64)
     *_, coarse, fine = detail_variances(variance, true_means=True)
-    # On the grid of thirds both nodes begin at odd pixels: of 2, and of 4.
-    for level, node, begin in ((fine, 2, 1), (coarse, 4, 3)):
+    # Their nodes, of 2 and of 4 pixels, begin with the image.
+    for level, node, begin in ((fine, 2, 2), (coarse, 4, 4)):
         block = variance[:, :, begin : begin + node, begin : begin + node].sum((-2, -1))
         for orientation in range(3):
-            torch.testing.assert_close(level[:, :, orientation, 1, 1], block / node**4)
+            torch.testing.assert_close(
+                level.expand(-1, -1, 3, -1, -1)[:, :, orientation, 1, 1], block / node**4
+            )
 
 
 def made(seed: int) -> tuple[Cortex, tuple[Tensor, ...], Tensor]:

@@ -5,7 +5,7 @@ import torch
 
 from tests.reference import calibrated, paper
 from torch_vdm import quadtree
-from torch_vdm.grid import Before, Grid, thirds
+from torch_vdm.grid import UNSHIFTED, Before, Grid, thirds
 from torch_vdm.quadtree import apart, pad_even, push, stacked
 
 SIZES = [(1, 1), (1, 2), (2, 1), (2, 2), (3, 5), (8, 8), (7, 12)]
@@ -69,8 +69,11 @@ def test_thirds_begin_a_third_of_a_node_before_the_image(side: int) -> None:
                 -begin,
                 nodes,
             )
-        if octave > 0 and nodes > 2:  # within a pixel
-            assert min(abs(3 * begin - node), abs(3 * begin - 2 * node)) <= 2
+        if octave > UNSHIFTED and nodes > 2:  # within a node that is not shifted
+            within = 2 * 2**UNSHIFTED
+            assert min(abs(3 * begin - node), abs(3 * begin - 2 * node)) <= within
+        if octave <= UNSHIFTED:
+            assert begin == 0
         first, last = grid.sides((side, 1), octave)[0][1:]
         assert first * node == min(node, node - begin)
         assert (nodes - 2 + first + last) * node == side

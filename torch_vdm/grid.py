@@ -13,6 +13,11 @@ Before = tuple[int, int]
 
 NONE: Before = (0, 0)
 
+# Octaves, from the pixels up, that begin at the corner. Shifted too, they leave the last row of
+# pixels alone in a node and in its parent, and the eye adapted to that row, black as it may be.
+# Status: choice.
+UNSHIFTED = 2
+
 
 class Side(NamedTuple):
     """How the nodes of a plane lie along one side of an image."""
@@ -84,9 +89,9 @@ PAPERS = Grid()
 def thirds(size: tuple[int, int]) -> Grid:
     """Return the grid whose nodes begin a third of a node, or two, before the image's corner.
 
-    At every second level, from the pixels on, one node is put before the first: then the nodes of
-    2^k pixels begin (...0101) pixels before the corner, a binary number of k digits. Not where two
-    nodes are left, which are the children of the last one.
+    From `UNSHIFTED` on, at every second level, one node is put before the first: then the nodes of
+    2^k pixels begin (...010100) pixels before the corner, a binary number of k digits. Not where
+    two nodes are left, which are the children of the last one.
     """
     rows, columns = map(_thirds, size)
     return Grid(rows, columns)
@@ -95,7 +100,8 @@ def thirds(size: tuple[int, int]) -> Grid:
 def _thirds(nodes: int) -> tuple[int, ...]:
     steps: list[int] = []
     while nodes > 1:
-        step = 1 if len(steps) % 2 == 0 and nodes > 2 else 0
+        octave = len(steps)
+        step = 1 if octave >= UNSHIFTED and octave % 2 == 0 and nodes > 2 else 0
         steps.append(step)
         nodes = (nodes + step + 1) // 2
     return tuple(steps)

@@ -143,9 +143,13 @@ def _loss(
     if not (first or second):
         with torch.no_grad():
             items: Tensor = module.of_items(test, reference, mask)
-        return items, _like(test, False), _like(reference, False)
+        return items, _like(test, False, items.dtype), _like(reference, False, items.dtype)
+    # In the precision of the computation: they are cast when the loss's own scale is in them.
+    dtype = _precision(test, reference)
     items, found = _gradients(
-        lambda *images: module.of_items(*images, mask), test, reference, first, second
+        lambda *images: module.of_items(*images, mask),
+        *(test.to(dtype), reference.to(dtype)),
+        *(first, second),
     )
     return items, *found
 
@@ -160,20 +164,23 @@ def _(
     second: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     del mask, number
-    items = test.new_empty(len(test), dtype=_precision(test, reference))
-    return items, _like(test, first), _like(reference, second)
+    dtype = _precision(test, reference)
+    items = test.new_empty(len(test), dtype=dtype)
+    return items, _like(test, first, dtype), _like(reference, second, dtype)
 
 
 def _keep_loss(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    del inputs
+    ctx.dtypes = [image.dtype for image in inputs[:2]]
     ctx.save_for_backward(*output[1:])
     ctx.mark_non_differentiable(*output[1:])
 
 
 def _of_loss(ctx: Any, slope: Tensor, *_: Tensor | None) -> tuple[Tensor | None, ...]:
     found = [
-        slope.view(-1, 1, 1, 1).to(part.dtype) * part if want else None
-        for part, want in zip(ctx.saved_tensors, ctx.needs_input_grad[:2], strict=True)
+        (slope.view(-1, 1, 1, 1) * part).to(dtype) if want else None
+        for part, dtype, want in zip(
+            ctx.saved_tensors, ctx.dtypes, ctx.needs_input_grad[:2], strict=True
+        )
     ]
     return *found, None, None, None, None
 
@@ -204,9 +211,9 @@ def _gradients(
     return value.detach(), (slopes[0], slopes[1])
 
 
-def _like(image: Tensor, wanted: bool) -> Tensor:
+def _like(image: Tensor, wanted: bool, dtype: torch.dtype | None = None) -> Tensor:
     """Return what a gradient of an image is, or none of its numbers; contiguous."""
-    return image.new_empty(image.shape if wanted else (0,))
+    return image.new_empty(image.shape if wanted else (0,), dtype=dtype or image.dtype)
 
 
 def _precision(test: Tensor, reference: Tensor) -> torch.dtype:

@@ -201,7 +201,7 @@ class PairMetric(nn.Module):
         Tensor
             (B, 1, H, W), JND.
         """
-        if operators.is_wanted():
+        if operators.is_wanted() and self._has_own_constants():
             return operators.difference_map(test, reference, self._number, power=False)
         test, reference, seen = self._checked(test, reference)
         total = self._total(test, reference)
@@ -217,7 +217,7 @@ class PairMetric(nn.Module):
         (B, 1, H, W), from (B, 3, H, W) twice. Smooth where the images are equal, so that a loss
         is taken from here; see `VDMLoss`.
         """
-        if operators.is_wanted():
+        if operators.is_wanted() and self._has_own_constants():
             return operators.difference_map(test, reference, self._number, power=True)
         return self._power(*self._checked(test, reference))
 
@@ -225,6 +225,14 @@ class PairMetric(nn.Module):
         """Return `power` of two checked batches."""
         total = self._total(test, reference)
         return masked(self._to_pixels(total, (test.shape[-2], test.shape[-1])), seen)
+
+    def _has_own_constants(self) -> bool:
+        """Return whether no constant is replaced, and none requires a gradient."""
+        for name, own in self._own.items():
+            buffer = self._buffers[name]
+            if buffer is not own or own.requires_grad:
+                return False
+        return True
 
     def _constants(self, dtype: torch.dtype, *names: str) -> dict[str, Tensor]:
         """Return constants in the precision of the computation: those named, or all."""

@@ -162,17 +162,18 @@ class Row:
 def rows_of(side: int) -> list[Row]:
     """Every level's nodes along a side, those of one pixel first, down to a single one.
 
-    Nodes of 4^i pixels begin a third of one before the image, those of 2 x 4^i pixels two thirds,
-    both rounded down to pixels. Where two are left the next level has both in one.
+    Nodes of 1, 2 and 4 pixels begin with the image. Of the next, those of 4^i pixels begin a third
+    of one before it, those of 2 x 4^i pixels two thirds, both rounded down to nodes of 4 pixels.
+    Where two are left the next level has both in one.
     """
     rows = [Row(1, 0, side)]
     while rows[-1].nodes() > 1:
         node = 2 * rows[-1].node
         # Of node = 4^i a third, of 2 x 4^i two: a third of the least power of 4 that is no smaller.
         power = 1
-        while power < node:
+        while 4 * power < node:
             power *= 4
-        begin = rows[-1].begin if rows[-1].nodes() == 2 else -(power // 3)
+        begin = rows[-1].begin if rows[-1].nodes() == 2 else -4 * (power // 3)
         rows.append(Row(node, begin, side))
     return rows
 

@@ -49,7 +49,7 @@ class Haar:
         checked_csf(self.csf)
 
     def grid(self, size: tuple[int, int], true_means: bool) -> Grid:
-        """Return where the nodes lie on an image: a third of a node off with ``true_means``."""
+        """Return where the nodes lie on an image: `thirds` with ``true_means``."""
         return thirds(size) if true_means else PAPERS
 
     def decompose(
