@@ -17,7 +17,8 @@ from torch_vdm.io import load, read_image
 Planes = NDArray[Any]
 
 AOVS = ("AO", "DiffCol", "Normal", "albedo", "diffuse_direct", "N", "crypto00")
-BEAUTIES = ("Combined", "beauty", "rgba", "color", "colour", "COMBINED", "Beauty")
+BEAUTIES = ("Combined", "beauty", "COMBINED", "Beauty")
+WHOLE_NAMES = ("rgba", "color", "colour", "RGB")
 
 
 def named(letters: tuple[str, ...], values: Planes, prefix: str = "") -> dict[str, Planes]:
@@ -27,19 +28,21 @@ def named(letters: tuple[str, ...], values: Planes, prefix: str = "") -> dict[st
 
 
 @given(
-    beauty=st.sampled_from((*BEAUTIES, "")),
-    owner=st.sampled_from(("", "ViewLayer", "a.b")),
+    called=st.one_of(
+        st.tuples(st.sampled_from((*BEAUTIES, "")), st.sampled_from(("", "ViewLayer", "a.b"))),
+        st.tuples(st.sampled_from(WHOLE_NAMES), st.just("")),
+    ),
     aovs=st.lists(st.sampled_from(AOVS), max_size=4, unique=True),
     letters=st.sampled_from([("R", "G", "B"), ("r", "g", "b"), ("red", "green", "blue")]),
 )
 def test_the_picture_comes_before_what_goes_into_it(
-    beauty: str,
-    owner: str,
+    called: tuple[str, str],
     aovs: list[str],
     letters: tuple[str, ...],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     values = planes()
+    beauty, owner = called
     prefix = f"{owner}.{beauty}" if owner and beauty else beauty
     channels = named(letters, values, prefix)
     for number, aov in enumerate(aovs):
@@ -68,6 +71,37 @@ def test_several_layers_are_refused_and_listed(tmp_path: Path) -> None:
     assert "'Back.Combined', 'Front.Combined'" in refusal(path, part="Combined")
     np.testing.assert_array_equal(read_image(path, part="Back.Combined"), values / 2)
     assert "no named parts and layers 'Back.Combined', 'Front.Combined'" in refusal(path, part="x")
+
+
+@pytest.mark.parametrize("data", ["XYZ", "Y"])
+@pytest.mark.parametrize("name", ["beauty", "ViewLayer.Combined", "rgba"])
+def test_data_of_no_layer_are_not_the_picture(tmp_path: Path, data: str, name: str) -> None:
+    values = planes()
+    positions = dict(zip(data, planes(6)[3:], strict=False))
+    path = write_exr(tmp_path / "image.exr", positions | named(("R", "G", "B"), values, name))
+    image = load(path)
+    np.testing.assert_array_equal(image.pixels, values)
+    assert f"Channels that are not used: {', '.join(data)}." in image.notes
+
+
+def test_data_or_grey_beside_a_layer_is_refused(tmp_path: Path) -> None:
+    values = planes()
+    channels = {"Y": values[0]} | named(("R", "G", "B"), values, "albedo")
+    path = write_exr(tmp_path / "image.exr", channels)
+    assert "got the layers '' (no layer), 'albedo'; choose one with --part NAME" in refusal(path)
+    np.testing.assert_array_equal(read_image(path, part="albedo"), values)
+    grey = np.broadcast_to(values[:1], values.shape)
+    np.testing.assert_array_equal(read_image(path, part=""), grey)
+
+
+@pytest.mark.parametrize("name", ["albedo.color", "albedo.rgb", "Diffuse.rgba"])
+def test_the_colour_of_another_layer_is_not_the_picture(tmp_path: Path, name: str) -> None:
+    values = planes()
+    channels = named(("R", "G", "B"), values, "main") | named(("R", "G", "B"), values / 2, name)
+    told = refusal(write_exr(tmp_path / "image.exr", channels))
+    assert "expected one image, got the layers" in told
+    assert repr(name) in told
+    assert "'main'" in told
 
 
 def test_the_only_layer_is_the_picture(tmp_path: Path) -> None:

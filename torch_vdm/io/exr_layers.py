@@ -19,9 +19,14 @@ _WORDS = {
     "A": ("a", "alpha"),
 }
 
+# Those that are a picture, and nothing else: X, Y, Z may be positions, and Y a depth.
+_PICTURES = MODELS[:2]
+
 # What the picture is called among layers that only go into it, in letters of either case: Blender's
-# and V-Ray's, Redshift's, Arnold's and Nuke's. Status: choice.
-_BEAUTY = ("combined", "beauty", "rgba", "rgb", "color", "colour")
+# and V-Ray's, Redshift's; and, as a whole name (albedo.color is none), Arnold's and Nuke's.
+# Status: choice.
+_BEAUTY = ("combined", "beauty")
+_BEAUTY_WHOLE = ("rgba", "rgb", "color", "colour")
 
 
 class Layer(NamedTuple):
@@ -66,18 +71,8 @@ def choose(
 def _best(parts: list[Part], candidates: list[Layer]) -> list[Layer]:
     """The candidates that look most like the picture: one, or its views."""
 
-    def rank(layer: Layer) -> tuple[bool, int, bool]:
-        last = layer.name.rpartition(".")[2].lower()
-        beauty = (
-            0
-            if not layer.name
-            else 1
-            if last in _BEAUTY
-            else 2
-            if layer.prefix in ("", layer.view)
-            else 3
-        )
-        return parts[layer.part].deep, beauty, layer.model != RGB
+    def rank(layer: Layer) -> tuple[bool, int]:
+        return parts[layer.part].deep, _likeness(layer)
 
     best = min(map(rank, candidates))
     same = [layer for layer in candidates if rank(layer) == best]
@@ -90,6 +85,20 @@ def _best(parts: list[Part], candidates: list[Layer]) -> list[Layer]:
         )
     order = _views(parts)
     return sorted(same, key=lambda layer: order.index(layer.view) if layer.view in order else -1)
+
+
+def _likeness(layer: Layer) -> int:
+    """How little a layer looks like the picture; those of the same number are as good."""
+    own = layer.prefix in ("", layer.view)
+    picture = layer.model in _PICTURES
+    name = layer.name.lower()
+    if not name and picture:
+        return 0 if layer.model == RGB else 1
+    if name in _BEAUTY_WHOLE or name.rpartition(".")[2] in _BEAUTY:
+        return 2 if layer.model == RGB else 3
+    if own and picture:  # of a part
+        return 4 if layer.model == RGB else 5
+    return 6
 
 
 def _candidates(parts: list[Part], wanted: int | str | None) -> list[Layer]:
@@ -106,6 +115,8 @@ def _candidates(parts: list[Part], wanted: int | str | None) -> list[Layer]:
         if not indices:
             return _layers_called(parts, found, wanted)
     candidates = [layer for layer in usual if layer.part in indices]
+    if wanted == "":  # what belongs to no layer
+        candidates = [layer for layer in candidates if layer.prefix in ("", layer.view)]
     if not candidates:
         part = parts[indices[0]]
         _refuse_deep(part)
@@ -206,7 +217,7 @@ def _part_title(part: Part, view: str) -> str:
 def _titles(parts: list[Part], layers: list[Layer]) -> list[str]:
     """Names by which layers can be asked for."""
     if len({layer.name for layer in layers}) == len(layers):
-        return [repr(layer.name) for layer in layers]
+        return [repr(layer.name) if layer.name else "'' (no layer)" for layer in layers]
     return [f"part {layer.part} ({short(parts[layer.part].name)!r})" for layer in layers]
 
 

@@ -171,11 +171,11 @@ def load(
     The content decides the format; the name is used in messages, and where TGA is meant. What is
     read of which format, and what is refused: docs/files.md.
 
-    OpenEXR: channels R, G, B (r, red, .R), else Y, RY, BY (luminance and chroma), else X, Y, Z
-    (CIE), else Y (grey), of no layer, else of one called Combined, beauty, rgba, color or colour,
-    else of the only layer there is. Primaries other than BT.709's are converted. The image has the
-    size of the display window. Of a tiled file with several levels the full resolution is read.
-    Deep files are refused.
+    OpenEXR: channels R, G, B (r, red, .R), else Y, RY, BY (luminance and chroma), of no layer, else
+    of a layer called Combined, beauty, rgba, color or colour, else of the only layer there is; X, Y,
+    Z (CIE) or Y (grey) of no layer where there is nothing else. Primaries other than BT.709's are
+    converted. The image has the size of the display window. Of a tiled file with several levels
+    the full resolution is read. Deep files are refused.
 
     Other formats: grey, palette and 16-bit files too. What a file says of its colours (cICP, ICC
     profile, gAMA and cHRM) and of its orientation is followed. CMYK, animations and several
@@ -187,7 +187,8 @@ def load(
         The file.
     part
         Which part of an OpenEXR file: its index from 0, its name, or the name of a layer, whole
-        (``ViewLayer.Combined``) or its last word. None: what looks like the picture.
+        (``ViewLayer.Combined``) or its last word, or "" for what belongs to no layer. None: what
+        looks like the picture.
     view
         Which view of a multi-view OpenEXR file. None: the first.
     channels
