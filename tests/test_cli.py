@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +18,7 @@ from tests.test_io import ACES, hand_made_exr, png16, rgb, write_exr
 from torch_vdm import VDM, Display, Haar, StationaryHaar, Steerable, __version__
 from torch_vdm.cli import main
 from torch_vdm.cortex import Transform
-from torch_vdm.io import read_image, write_channels, write_image
+from torch_vdm.io import ImageError, load, read_image, write_channels, write_image
 
 Pair = tuple[str, str]
 
@@ -535,6 +536,32 @@ def test_arrays_that_are_refused(
     line = one_line_error(capsys, "compare", *[str(tmp_path / "image.npy")] * 2)
     assert "image.npy: expected numbers of uint8, uint16, float16" in line
     assert f"got {dtype}" in line
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (-3, 4, 4)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (3, 4, 999999999999999999999)}",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (3, 4, 4)",
+        "((((",
+        "-" * 9000 + "1",
+    ],
+)
+def test_damaged_arrays_are_refused(
+    tmp_path: Path, header: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "image.npy"
+    size = struct.pack("<H", len(header))
+    path.write_bytes(b"\x93NUMPY\1\0" + size + header.encode() + bytes(192))
+    line = one_line_error(capsys, "compare", str(path), str(path))
+    assert "image.npy: damaged or no array: " in line
+
+
+def test_arrays_are_not_for_load(tmp_path: Path) -> None:
+    np.save(tmp_path / "image.npy", np.zeros((3, 8, 9), np.float32))
+    with pytest.raises(ImageError, match=r"use numpy\.load or torch_vdm\.io\.ArrayFile"):
+        load(tmp_path / "image.npy")
 
 
 def test_floats_may_be_coded(

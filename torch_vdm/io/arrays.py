@@ -101,8 +101,10 @@ class ArrayFile:
     def _array(self) -> NDArray[Any]:
         try:
             array: NDArray[Any] = np.load(self.path, mmap_mode="r")
-        except (OSError, ValueError, EOFError) as error:
-            self._refuse(f"damaged or no array: {' '.join(str(error).split())}; write it again")
+        except Exception as error:
+            # NumPy reads the header as Python, and raises whatever that raises when it is damaged.
+            told = " ".join(str(error).split())[:200]
+            self._refuse(f"damaged or no array: {told}; write it again")
         if array.ndim == 3 and array.shape[0] != 3 and array.shape[2] == 3:
             array = array.transpose(2, 0, 1)
         return array

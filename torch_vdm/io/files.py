@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from torch_vdm.io.alpha import colour, over
+from torch_vdm.io.arrays import MAGIC as ARRAY_MAGIC
 from torch_vdm.io.decoded import Decoded, Kind
 from torch_vdm.io.exr import Choice, encode_exr, load_exr
 from torch_vdm.io.netpbm import load_pfm, load_pnm
@@ -172,9 +173,9 @@ def load(
     read of which format, and what is refused: docs/files.md.
 
     OpenEXR: channels R, G, B (r, red, .R), else Y, RY, BY (luminance and chroma), of no layer, else
-    of a layer called Combined, beauty, rgba, color or colour, else of the only layer there is; X, Y,
-    Z (CIE) or Y (grey) of no layer where there is nothing else. Primaries other than BT.709's are
-    converted. The image has the size of the display window. Of a tiled file with several levels
+    of a layer called Combined, beauty, rgba, color or colour, else of the only layer there is; or
+    X, Y, Z (CIE) or Y (grey) of no layer where there is nothing else. Primaries other than BT.709's
+    are converted. The image has the size of the display window. Of a tiled file with several levels
     the full resolution is read. Deep files are refused.
 
     Other formats: grey, palette and 16-bit files too. What a file says of its colours (cICP, ICC
@@ -476,6 +477,10 @@ def _content(head: bytes, path: PathLike, notes: list[str]) -> str:
             return content
     if named == "TGA":
         return named
+    if head.startswith(ARRAY_MAGIC):
+        raise ImageError(
+            "expected an image, got a NumPy array; use numpy.load or torch_vdm.io.ArrayFile"
+        )
     known = ", ".join(dict.fromkeys(SUFFIXES.values()))
     raise ImageError(
         f"expected an image ({known}), got other content (it begins with bytes "
