@@ -3,6 +3,7 @@
 import io
 import struct
 import sys
+import tracemalloc
 import zlib
 from pathlib import Path
 from typing import Any
@@ -669,6 +670,24 @@ def test_of_a_large_openexr_file_only_the_wanted_part_is_read(tmp_path: Path) ->
         except OSError:
             pytest.skip("the file system has no sparse files")
     np.testing.assert_array_equal(load(path).pixels, values)
+
+
+def test_tiles_are_counted_before_they_are_listed(tmp_path: Path) -> None:
+    path = hand_made_exr(
+        tmp_path / "image.exr",
+        {name: (np.zeros((1, 1), np.float32), 1) for name in "RGB"},
+        flags=0x200,
+        attributes={
+            "tiles": ("tiledesc", struct.pack("<IIB", 1, 1, 0)),
+            "dataWindow": ("box2i", struct.pack("<iiii", 0, 0, 1999, 1999)),
+        },
+    )
+    tracemalloc.start()
+    try:
+        assert "the table of its 4000000 blocks of pixels" in refusal(path)
+        assert tracemalloc.get_traced_memory()[1] < 2**22
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_block_that_is_larger_than_its_pixels_is_not_read(tmp_path: Path) -> None:

@@ -98,23 +98,22 @@ def _blocks(data: Bytes, part: Part, table: int, index: int | None) -> list[tupl
     width, height = part.size
     if part.tiled:
         columns, rows, _ = value_of(part.attributes, "tiles", "<IIB")
-        across = -(-width // columns)
-        places = [
-            struct.pack("<iiii", x, y, 0, 0)
-            for y in range(-(-height // rows))
-            for x in range(across)
-        ]
+    else:
+        columns, rows = width, _BLOCK_ROWS[value_of(part.attributes, "compression", "<B")[0]]
+    across, down = -(-width // columns), -(-height // rows)
+    # Before a list is made of them: a file of some bytes may declare millions.
+    if table < 0 or table + 8 * across * down > len(data):
+        raise ImageError(
+            f"incomplete: the file ends in the table of its {across * down} blocks of pixels; "
+            "render or copy it again"
+        )
+    if part.tiled:
+        places = [struct.pack("<iiii", x, y, 0, 0) for y in range(down) for x in range(across)]
         moved = places
     else:
-        rows = _BLOCK_ROWS[value_of(part.attributes, "compression", "<B")[0]]
         top = part.window[1]
         places = [struct.pack("<i", y) for y in range(top, top + height, rows)]
         moved = [struct.pack("<i", y) for y in range(0, height, rows)]
-    if table < 0 or table + 8 * len(places) > len(data):
-        raise ImageError(
-            f"incomplete: the file ends in the table of its {len(places)} blocks of pixels; "
-            "render or copy it again"
-        )
     offsets = struct.unpack(f"<{len(places)}Q", data[table : table + 8 * len(places)])
     largest = _largest_block(part)
     blocks = []
