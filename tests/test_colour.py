@@ -321,6 +321,7 @@ def test_a_profile_of_tables_goes_through_lcms_or_is_refused(tmp_path: Path) -> 
     lightness = (1 / 3 * 100 + 16) / 116
     np.testing.assert_allclose(image.pixels, srgb_code(np.full((3, 4, 4), lightness**3)), atol=0.01)
     assert "by its ICC profile's tables, with 8 bits" in image.notes[0]
+    assert "those that sRGB lacks are clipped" in image.notes[0]
     deep = write(tmp_path / "deep.png", iccp(bytes(data)))
     assert "expected an ICC profile of a matrix and curves" in refusal(deep)
 

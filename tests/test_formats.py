@@ -458,6 +458,25 @@ def test_a_tiff_with_a_thumbnail_is_one_picture(tmp_path: Path, dtype: str, firs
     np.testing.assert_array_equal(load(path).pixels, unit(values))
 
 
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_tiff_tells_of_channels_that_it_leaves_out(tmp_path: Path, dtype: str) -> None:
+    values = np.random.default_rng(1).integers(0, 2, (5, 4, 5)).astype(dtype)
+    path = tmp_path / "image.tiff"
+    left = "1 channel of unspecified meaning beside the colours is left out."
+    for extra in (["unspecified"], ["unassalpha", "unspecified"]):
+        stored = values[..., : 3 + len(extra)]
+        tifffile.imwrite(path, stored, photometric="rgb", planarconfig="contig", extrasamples=extra)
+        image = load(path)
+        assert left in image.notes
+        assert (image.alpha is None) == (extra == ["unspecified"])
+    tifffile.imwrite(
+        path, values[..., :4], photometric="rgb", planarconfig="contig", extrasamples=[2]
+    )
+    assert left not in load(path).notes
+    PIL.Image.new("RGBX", (4, 5)).save(path, compression="tiff_lzw")
+    assert left in load(path).notes
+
+
 def test_tiff_that_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "image.tiff"
     image = np.zeros((4, 5, 3), np.uint8)

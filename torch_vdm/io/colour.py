@@ -136,7 +136,10 @@ def _by_profile(codes: Floats, data: bytes, bits: int, notes: list[str]) -> tupl
             "expected an ICC profile of a matrix and curves for more than 8 bits, got one with "
             "tables; convert the image to sRGB first"
         )
-    notes.append("Colours are converted to sRGB by its ICC profile's tables, with 8 bits.")
+    notes.append(
+        "Colours are converted to sRGB by its ICC profile's tables, with 8 bits; those that sRGB "
+        "lacks are clipped, and their differences with them."
+    )
     return icc.through_lcms(codes, data), "coded"
 
 

@@ -48,6 +48,7 @@ def load_tiff(data: bytes, repair: Repair, coded: bool, notes: list[str]) -> Dec
             size = page.imagewidth * page.imagelength * samples * page.bitspersample // 8
             check_size(page.imagewidth, page.imagelength, size, len(data))
             chromaticities = _chromaticities(page)
+            _tell_left_out(page, notes)
             if _is_for_pillow(page):
                 return load_picture(data, "TIFF", notes, chromaticities)
             _check(page)
@@ -80,6 +81,23 @@ def _only_page(pages: list["TiffPage"]) -> "TiffPage":
     if _is_for_pillow(whole[0]) and whole[0] is not pages[0]:
         raise ImageError("expected the picture before its thumbnails; save it again without them")
     return whole[0]
+
+
+def _tell_left_out(page: "TiffPage", notes: list[str]) -> None:
+    """Tell of samples that are neither colour nor alpha: an old alpha without its mark, or data."""
+    named = page.samplesperpixel - len(page.extrasamples)
+    colours = min(named, 3) if page.photometric == RGB else named
+    left = page.samplesperpixel - colours - len(_opacity(page)[:1])
+    if left:
+        notes.append(
+            f"{left} channel{'s' * (left > 1)} of unspecified meaning beside the colours "
+            f"{'are' if left > 1 else 'is'} left out."
+        )
+
+
+def _opacity(page: "TiffPage") -> list[int]:
+    """Which of the extra samples are alpha."""
+    return [i for i, kind in enumerate(page.extrasamples) if kind in (ASSOCIATED, UNASSOCIATED)]
 
 
 def _is_for_pillow(page: "TiffPage") -> bool:
@@ -125,8 +143,7 @@ def _values(page: "TiffPage") -> NDArray[Any]:
     if page.photometric == GREY_WHITE_IS_0 and values.dtype.kind == "u":
         values = np.invert(values)
     colours = samples - len(page.extrasamples)
-    opacity = [i for i, kind in enumerate(page.extrasamples) if kind in (ASSOCIATED, UNASSOCIATED)]
-    kept = [*range(colours), *(colours + i for i in opacity[:1])]
+    kept = [*range(colours), *(colours + i for i in _opacity(page)[:1])]
     return values[..., kept]
 
 
