@@ -231,7 +231,9 @@ def _common_views(images: Sequence[_Opened], paths: Sequence[Path]) -> tuple[lis
     for name, views in zip(_names(paths), (one, other), strict=True):
         alone = [view for view in views if view not in common]
         if alone:
-            told.append(f"{name}: the other file lacks its views {listed(alone)}: left out")
+            told.append(
+                f"{name}: views that the other file lacks are not compared: {listed(alone)}"
+            )
     return common, told
 
 

@@ -55,7 +55,7 @@ def load_tiff(data: bytes, repair: Repair, coded: bool, notes: list[str]) -> Dec
             values = _values(page)
             profile = _profile(page)
             turn = _tag(page, ORIENTATION)
-            associated = ASSOCIATED in page.extrasamples
+            associated = [page.extrasamples[i] for i in _opacity(page)[:1]] == [ASSOCIATED]
     except (ImageError, MemoryError):
         raise
     except Exception as error:
