@@ -112,6 +112,10 @@ def test_a_wrapper_that_casts_buffers_changes_no_answer(make: Callable[[], PairM
             assert torch.equal(metric(*images(found.dtype)), found)
     compiled = torch.compile(metric, backend="eager")
     assert torch.equal(compiled(*images()), expected[0])
+    # Or with other tensors in their place.
+    for name, buffer in metric.named_buffers():
+        setattr(metric, name, buffer.bfloat16())
+    assert torch.equal(metric(*images()), expected[0])
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")

@@ -137,7 +137,8 @@ class PairMetric(nn.Module):
 
         Once for each precision of the computation, and once more as buffers, which show where the
         module is. One that `torch.func.functional_call` replaces counts, and one that requires a
-        gradient; what else is done to it, as by a wrapper that casts it, changes no answer.
+        gradient; what else is done to it, as by a wrapper that casts it to half precision, in place
+        or not, changes no answer.
         """
         look_at(device)
 
@@ -228,11 +229,14 @@ class PairMetric(nn.Module):
 
     def _has_own_constants(self) -> bool:
         """Return whether no constant is replaced, and none requires a gradient."""
-        for name, own in self._own.items():
-            buffer = self._buffers[name]
-            if buffer is not own or own.requires_grad:
-                return False
-        return True
+        return all(self._is_own(name) for name in self._own)
+
+    def _is_own(self, name: str) -> bool:
+        """Return whether a constant is what the options say: itself, or as a wrapper casts it."""
+        buffer = self._buffers[name]
+        assert buffer is not None
+        same = buffer is self._own[name] or buffer.dtype in (torch.float16, torch.bfloat16)
+        return same and not buffer.requires_grad
 
     def _constants(self, dtype: torch.dtype, *names: str) -> dict[str, Tensor]:
         """Return constants in the precision of the computation: those named, or all."""
@@ -246,8 +250,7 @@ class PairMetric(nn.Module):
         for name in names or own:
             buffer = buffers[name]
             assert buffer is not None
-            kept = buffer is own[name] and not buffer.requires_grad
-            found[name] = exact[name] if kept else buffer.to(dtype)
+            found[name] = exact[name] if self._is_own(name) else buffer.to(dtype)
         return found
 
     def _total(self, test: Tensor, reference: Tensor) -> Tensor:
