@@ -102,7 +102,7 @@ class VDMLoss(nn.Module):
         ValueError, for which one number is read back from the device; with ``nonfinite="mask"`` or
         in a graph of torch.export nothing is, and the loss is NaN.
         """
-        by_mask = mask is not None and mask.requires_grad
+        by_mask = isinstance(mask, Tensor) and mask.requires_grad
         if operators.is_wanted() and self.metric._has_own_constants() and not by_mask:
             items = operators.loss_of_items(test, reference, mask, self._number)
         else:
