@@ -31,7 +31,7 @@ SIDE, CORNER = 256, 100
 # 5 JND.
 NOISE, WAVE, GRAIN, RESIDUE, PATCH, BANDS, CAST = 0.02, 0.02, 0.15, 0.015, 8, 40.0, 0.03
 
-# Of accuracy's figures and of these.
+# Beside what the others are held.
 JUDGE = "reference"
 
 

@@ -37,6 +37,7 @@ from torch_vdm.cli import (
     run,
     tell,
 )
+from torch_vdm.distance import VISIBLE
 from torch_vdm.io import atomic_path, write_channels
 
 # Seconds between two checkpoints. Status: choice.
@@ -275,7 +276,9 @@ class _Job:
             "samples_total": progress.samples,
             "spp_mean": progress.samples / (height * width),
             "predicted_max_jnd": report.predicted if report is not None else None,
-            "visible_fraction": report.visible if report is not None else None,
+            "visible_fraction": (
+                float((report.jnd > VISIBLE).mean()) if report is not None else None
+            ),
             "over_tolerance_fraction": report.over if report is not None else None,
             # A pixel without a finite sample is black, and nothing is known of it.
             "converged": report is not None and report.converged and not empty,

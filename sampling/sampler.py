@@ -18,7 +18,6 @@ from sampling.statistics import FIRST, PIECE, SECOND, Statistics
 from sampling.strategies import LARGEST_GROWTH, SMALLEST_GROWTH, STRATEGIES, HalfBuffer
 from sampling.variance import pooled_covariance
 from torch_vdm import VDM, Haar
-from torch_vdm.distance import VISIBLE
 from torch_vdm.quadtree import push
 
 Plane = NDArray[np.float64]
@@ -149,8 +148,6 @@ class Report(NamedTuple):
     """Largest visible difference from the converged image, in JND: not exceeded with 95 %."""
     over: float
     """Share of pixels that are predicted over the tolerance, 0 to 1."""
-    visible: float
-    """Share of pixels that are predicted over 1 JND, 0 to 1."""
     jnd: NDArray[np.float64]
     """(H, W), the predicted map, in JND; its maximum is ``predicted``."""
     forecast: int
@@ -369,7 +366,6 @@ class Sampler:
             spp=drawn / len(self._target),
             predicted=predicted,
             over=float((jnd > self.settings.tolerance).mean()),
-            visible=float((jnd > VISIBLE).mean()),
             jnd=jnd,
             forecast=forecast,
             nonfinite=int(statistics.nonfinite.sum()),

@@ -31,8 +31,8 @@ from torch_vdm.io.alpha import colour
 from torch_vdm.io.refusal import printable
 from torch_vdm.loading import Pair, displays_of, load_pairs
 from torch_vdm.observer import Observer
-from torch_vdm.report import Comparison, figures, table, write_heat_map
-from torch_vdm.tiling import SMALLEST_TILE, TILE, read
+from torch_vdm.report import Comparison, figures, plain_console, table, write_heat_map
+from torch_vdm.tiling import SMALLEST_TILE, TILE, whole
 from torch_vdm.vdm import VDM
 
 DONE, EXCEEDED, BAD_INPUT, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130
@@ -406,11 +406,8 @@ def _largest(
 
 def _whole(metric: VDM, pair: Pair) -> Tensor:
     """Return the map (H, W)."""
-    height, width = pair.size
-    everything = slice(0, height), slice(0, width)
-    batch = read(pair.test, 0, everything), read(pair.reference, 0, everything)
     with torch.no_grad():
-        jnd: Tensor = metric(*batch)[0, 0]
+        jnd: Tensor = metric(whole(pair.test), whole(pair.reference))[0, 0]
     return jnd
 
 
@@ -516,19 +513,8 @@ def _text(
     comparison: Comparison, luminances: tuple[float, float], options: argparse.Namespace
 ) -> str:
     """Return the table, the verdict, what was assumed and what was written."""
-    from rich.console import Console
-
-    terminal = Console()
-    # Plain text: nothing in a path is markup, and no number is coloured. Too narrow a terminal
-    # wraps lines; a table cut to its width would lose figures.
-    console = Console(
-        file=io.StringIO(),
-        force_terminal=terminal.is_terminal,
-        width=max(terminal.width, 72),
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
-    )
+    text = io.StringIO()
+    console = plain_console(text, 72)
     console.print(table(comparison, luminances))
     console.print(comparison.verdict(), style="bold")
     if options.observer == "paper" and not math.isclose(*luminances, rel_tol=1e-4):
@@ -542,8 +528,7 @@ def _text(
     for path in (options.map, options.json):
         if path is not None:
             console.print(f"written: {path}", style="dim")
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue()
+    return text.getvalue()
 
 
 def _channels(text: str) -> Mapping[str, str]:

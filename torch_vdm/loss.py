@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any, Literal, Self, get_args
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torch_vdm import operators
 from torch_vdm.cortex import Haar
@@ -34,7 +34,7 @@ DARK_LIGHT = 0.2
 EXPONENT = 2.4
 
 
-class VDMLoss(nn.Module):
+class VDMLoss(operators.Enrolled):
     """A perceptual loss: the mean of log(1 + p), and an L1 term.
 
     p is the map of `VDM` to the power of 2.4: smooth, 0 with gradient 0 where the images are equal.
@@ -92,7 +92,6 @@ class VDMLoss(nn.Module):
         self.metric._checkpointed = switch("checkpoint", checkpoint)
         self.l1 = l1
         self.reduction = reduction
-        self._number = operators.enrol(self)
 
     def forward(self, test: Tensor, reference: Tensor, mask: Tensor | None = None) -> Tensor:
         """Return the loss of (B, 3, H, W) against (B, 3, H, W).
@@ -120,11 +119,6 @@ class VDMLoss(nn.Module):
         exponent = self.metric.observer.summation_exponent / EXPONENT
         plane = torch.log1p(just_noticeable(power, power.new_tensor(exponent))) + l1
         return plane.mean((1, 2, 3)) if mask is None else self._weighted(plane, mask)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take the state of another, of which this is a copy."""
-        super().__setstate__(state)  # type: ignore[no-untyped-call]  # torch's own, without types
-        self._number = operators.enrol(self)
 
     def compile(self, *args: Any, **kwargs: Any) -> Self:  # type: ignore[override]
         """Switch the metric to its fast route, `VDM.compile`."""

@@ -2,7 +2,7 @@
 
 Traced through, all levels of a pyramid would become one graph, which takes the compiler half a
 minute for one size and far longer for a size that is symbolic. As an operator the module runs as it
-does outside: its own fast route, compiled once for every size.
+does outside, by the route that it takes there.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,16 +14,28 @@ from weakref import WeakValueDictionary
 import torch
 from torch import Tensor, nn
 
+from torch_vdm.precision import computed_in
+
 # An operator takes tensors and numbers: modules are known to it by number.
 _modules: WeakValueDictionary[int, nn.Module] = WeakValueDictionary()
 _numbers = count(1)
 
 
-def enrol(module: nn.Module) -> int:
-    """Return the number by which the operators know a module."""
-    number = next(_numbers)
-    _modules[number] = module
-    return number
+class Enrolled(nn.Module):
+    """A module that the operators know, and each copy of it by itself."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._enrol()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state of another, of which this is a copy."""
+        super().__setstate__(state)  # type: ignore[no-untyped-call]  # torch's own, without types
+        self._enrol()
+
+    def _enrol(self) -> None:
+        self._number = next(_numbers)
+        _modules[self._number] = self
 
 
 def is_wanted() -> bool:
@@ -69,9 +81,8 @@ def _as_outside() -> Iterator[None]:
 
 @torch.library.custom_op("torch_vdm::map", mutates_args=())
 def _map(test: Tensor, reference: Tensor, number: int, power: bool) -> Tensor:
-    module: Any = _modules[number]
     with torch.no_grad():
-        seen: Tensor = (module.power if power else module)(test, reference)
+        seen: Tensor = _function(number, power)(test, reference)
     return seen
 
 
@@ -79,7 +90,7 @@ def _map(test: Tensor, reference: Tensor, number: int, power: bool) -> Tensor:
 def _(test: Tensor, reference: Tensor, number: int, power: bool) -> Tensor:
     del number, power
     batch, _, height, width = test.shape
-    return test.new_empty((batch, 1, height, width), dtype=_precision(test, reference))
+    return test.new_empty((batch, 1, height, width), dtype=computed_in(test, reference))
 
 
 @torch.library.custom_op("torch_vdm::map_gradient", mutates_args=())
@@ -92,13 +103,10 @@ def _map_gradient(
     first: bool,
     second: bool,
 ) -> tuple[Tensor, Tensor]:
-    module: Any = _modules[number]
-
-    def total(test: Tensor, reference: Tensor) -> Tensor:
-        seen: Tensor = (module.power if power else module)(test, reference)
-        return (seen * slope).sum()
-
-    return _gradients(total, test, reference, first, second)[1]
+    function = _function(number, power)
+    return _gradients(
+        lambda *images: function(*images) * slope, *(test, reference), *(first, second)
+    )[1]
 
 
 @_map_gradient.register_fake
@@ -145,7 +153,7 @@ def _loss(
             items: Tensor = module.of_items(test, reference, mask)
         return items, _like(test, False, items.dtype), _like(reference, False, items.dtype)
     # In the precision of the computation: they are cast when the loss's own scale is in them.
-    dtype = _precision(test, reference)
+    dtype = computed_in(test, reference)
     items, found = _gradients(
         lambda *images: module.of_items(*images, mask),
         *(test.to(dtype), reference.to(dtype)),
@@ -164,7 +172,7 @@ def _(
     second: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     del mask, number
-    dtype = _precision(test, reference)
+    dtype = computed_in(test, reference)
     items = test.new_empty(len(test), dtype=dtype)
     return items, _like(test, first, dtype), _like(reference, second, dtype)
 
@@ -216,5 +224,8 @@ def _like(image: Tensor, wanted: bool, dtype: torch.dtype | None = None) -> Tens
     return image.new_empty(image.shape if wanted else (0,), dtype=dtype or image.dtype)
 
 
-def _precision(test: Tensor, reference: Tensor) -> torch.dtype:
-    return torch.float64 if torch.float64 in (test.dtype, reference.dtype) else torch.float32
+def _function(number: int, power: bool) -> Callable[..., Tensor]:
+    """Return an enrolled metric, or its power."""
+    module: Any = _modules[number]
+    function: Callable[..., Tensor] = module.power if power else module
+    return function

@@ -7,7 +7,7 @@ from dataclasses import fields
 from typing import Any, Literal, Self, get_args
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from torch_vdm import operators
@@ -31,7 +31,7 @@ from torch_vdm.images import (
 from torch_vdm.memory import keep_freed_memory
 from torch_vdm.observer import Observer
 from torch_vdm.options import choice, number
-from torch_vdm.precision import look_at, widest
+from torch_vdm.precision import computed_in, look_at, widest
 
 Nonfinite = Literal["raise", "mask"]
 
@@ -54,7 +54,7 @@ FORMER = {field.name for field in fields(Observer)} | {
 }
 
 
-class PairMetric(nn.Module):
+class PairMetric(operators.Enrolled):
     """A metric that maps the visible differences of two images.
 
     Subclasses give the accumulated differences of two checked batches, and how a plane of them
@@ -85,16 +85,10 @@ class PairMetric(nn.Module):
         self.nonfinite = nonfinite
         self._fast = False
         self._checkpointed = False
-        self._number = operators.enrol(self)
         self._range_is_known = False
         # In which of both images values out of range are told: any, or all.
         self._out_of_range_in: Callable[[Iterable[bool]], bool] = any
         keep_freed_memory()
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take the state of another, of which this is a copy."""
-        super().__setstate__(state)  # type: ignore[no-untyped-call]  # torch's own, without types
-        self._number = operators.enrol(self)
 
     def _kept(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a part of the forward pass, of which a checkpoint keeps the arguments alone.
@@ -314,8 +308,7 @@ class PairMetric(nn.Module):
                 "expected two images of one shape, "
                 f"got {tuple(test.shape)} and {tuple(reference.shape)}"
             )
-        double = torch.float64 in (test.dtype, reference.dtype)
-        dtype = torch.float64 if double else torch.float32
+        dtype = computed_in(test, reference)
         # In one layout: a tensor in another takes other paths through the vectorised loops, and
         # equal images would differ in their last bits.
         test, reference = test.to(dtype).contiguous(), reference.to(dtype).contiguous()

@@ -1,4 +1,4 @@
-"""How precise numbers can be on a device."""
+"""How precise numbers are: on a device, and of two images."""
 
 import torch
 
@@ -9,6 +9,11 @@ _without_float64 = {"mps"}
 def widest(device: torch.device) -> torch.dtype:
     """Return float64, or float32 where a device has nothing wider."""
     return torch.float32 if device.type in _without_float64 else torch.float64
+
+
+def computed_in(test: torch.Tensor, reference: torch.Tensor) -> torch.dtype:
+    """Return the precision in which two images are compared: float64 where one has it."""
+    return torch.float64 if torch.float64 in (test.dtype, reference.dtype) else torch.float32
 
 
 def look_at(device: torch.device) -> None:

@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, TextIO, TypedDict
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from torch_vdm.io import atomic_path
 from torch_vdm.tiling import Source, read
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from rich.console import Console, RenderableType
 
 # What a heat map's colours are cut at where the largest difference is smaller, in JND, so that
 # invisible differences look like nothing. Status: choice.
@@ -155,6 +155,25 @@ def _shrunk_map(jnd: Tensor) -> Tensor:
         functional.max_pool2d(band[None, None].float(), block, ceil_mode=True) for band in bands
     ]
     return torch.cat(parts, -2)[0, 0]
+
+
+def plain_console(text: TextIO, width: int) -> "Console":
+    """Return a console that writes to ``text`` for the terminal, as if it had ``width`` at least.
+
+    Plain text: nothing in a path is markup, and no number is coloured. Too narrow a terminal wraps
+    lines; a table cut to its width would lose figures.
+    """
+    from rich.console import Console
+
+    terminal = Console()
+    return Console(
+        file=text,
+        force_terminal=terminal.is_terminal,
+        width=max(terminal.width, width),
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
 
 
 def table(comparison: Comparison, luminances: tuple[float, float]) -> "RenderableType":

@@ -235,6 +235,12 @@ def read(source: Source, item: int, part: Slices) -> Tensor:
     return image.unsqueeze(0)
 
 
+def whole(source: Source) -> Tensor:
+    """Return all of a source (3, H, W), (1, 3, H, W)."""
+    height, width = source.shape[-2:]
+    return read(source, 0, (slice(0, height), slice(0, width)))
+
+
 def check_sources(test: Source, reference: Source) -> tuple[int, tuple[int, int]]:
     """Return the number of items and (H, W) of two sources of one shape; refuse others."""
     for name, source in (("test", test), ("reference", reference)):

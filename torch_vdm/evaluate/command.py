@@ -26,6 +26,7 @@ from torch_vdm.evaluate.journal import Journal, Result
 from torch_vdm.evaluate.judge import Bench, Judge, settings
 from torch_vdm.evaluate.statistics import Paired, counted
 from torch_vdm.io import check_target
+from torch_vdm.report import plain_console
 
 RESULTS, TABLE, PARQUET, REPORT = "results.json", "table.csv", "table.parquet", "report.html"
 
@@ -314,17 +315,8 @@ def _text(
     exceeded: Sequence[Result],
 ) -> str:
     """Return what is said on the terminal at the end."""
-    from rich.console import Console
-
-    terminal = Console()
-    console = Console(
-        file=io.StringIO(),
-        force_terminal=terminal.is_terminal,
-        width=max(terminal.width, 100),
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
-    )
+    text = io.StringIO()
+    console = plain_console(text, 100)
     console.print(_table(tests, results))
     for sentence in sentences:
         console.print(sentence, style="bold")
@@ -342,8 +334,7 @@ def _text(
             f"is {worst.frame} of {worst.test}, {worst.figures['max_jnd']:.2f} JND"
         )
     console.print(f"written: {options.output / REPORT}", style="dim")
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue()
+    return text.getvalue()
 
 
 def _table(tests: Sequence[str], results: Sequence[Result]) -> Any:

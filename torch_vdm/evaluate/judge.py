@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,8 +19,9 @@ from torch_vdm.evaluate.frames import Job
 from torch_vdm.evaluate.journal import Result
 from torch_vdm.io import write_image
 from torch_vdm.io.refusal import printable
+from torch_vdm.loading import Pair
 from torch_vdm.report import figures
-from torch_vdm.tiling import TILE, Source, read
+from torch_vdm.tiling import TILE, Source, whole
 from torch_vdm.vdm import VDM
 
 # Where maps, and pictures for the page, lie in the output folder.
@@ -31,22 +32,6 @@ NOT_SETTINGS = (
     "command", "reference", "test", "manifest", "output", "jobs", "resume", "fail_above", "junit",
     "parquet", "tile",
 )  # fmt: skip
-
-
-class Pair(Protocol):
-    """Two images made ready for one display."""
-
-    @property
-    def reference(self) -> Source:
-        """(3, H, W)."""
-
-    @property
-    def test(self) -> Source:
-        """(3, H, W)."""
-
-    @property
-    def display(self) -> Display:
-        """How both become light."""
 
 
 class Bench(NamedTuple):
@@ -183,7 +168,7 @@ class Judge:
         tile = self.options.tile or (TILE if height * width > self.bench.largest_whole else None)
         if tile:
             return metric.tiled(test, reference, tile)[0]
-        jnd: Tensor = metric(_whole(test), _whole(reference))[0, 0]
+        jnd: Tensor = metric(whole(test).float(), whole(reference).float())[0, 0]
         return jnd
 
     def _flicker(
@@ -282,15 +267,9 @@ def _content(path: Path) -> str:
         raise CannotJudge(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def _whole(source: Source) -> Tensor:
-    """Return all of a source (3, H, W), (1, 3, H, W)."""
-    height, width = source.shape[-2:]
-    return read(source, 0, (slice(0, height), slice(0, width))).float()
-
-
 def _light(source: Source, display: Display) -> Tensor:
     """Return linear light (3, H, W), 1.0 is white, as the display shows it."""
-    pixels = _whole(source)[0]
+    pixels = whole(source)[0].float()
     linear = decode_srgb(pixels) if display.encoding == "srgb" else pixels
     return linear.mul(2.0**display.exposure)
 

@@ -12,6 +12,7 @@ from torch_vdm.evaluate.journal import Result
 from torch_vdm.evaluate.judge import MAPS, PICTURES
 from torch_vdm.evaluate.tables import FIGURES, present
 from torch_vdm.io import atomic_path
+from torch_vdm.report import SMALLEST_SCALE
 
 
 def write(
@@ -53,7 +54,7 @@ def write(
         "fail_above": settings.get("fail_above"),
         "borders": maps.BORDERS,
         "palette": base64.b64encode(pictures.palette().tobytes()).decode(),
-        "scale": pictures.SMALLEST_SCALE,
+        "scale": SMALLEST_SCALE,
         "steps": pictures.STEPS,
         "maps": MAPS,
         "pictures": PICTURES,

@@ -26,6 +26,7 @@ from torch.nn import functional
 
 from torch_vdm.display import encode_srgb
 from torch_vdm.io import atomic_path
+from torch_vdm.report import SMALLEST_SCALE
 
 # A side of a picture that the page shows, in pixels; larger images are shown by blocks of pixels.
 # A browser's canvas takes more, but not much. Status: choice.
@@ -33,10 +34,6 @@ LARGEST_SIDE = 4096
 
 # Sides of the small pictures of maps, in pixels. Status: choice.
 THUMBNAIL = 320
-
-# What a map's colours are cut at where the largest difference is smaller, in JND. Status: choice;
-# the same as in the heat map of `torch_vdm.report`.
-SMALLEST_SCALE = 2.0
 
 # Hundredths of a JND: what the page prints. Status: choice.
 STEPS = 100

@@ -6,12 +6,12 @@ Codes and light from 0 to 1 unless said otherwise; arrays of any shape and float
 from typing import Any, TypeAlias
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-Values: TypeAlias = NDArray[Any]
+from torch_vdm import display
 
-# IEC 61966-2-1: slope and end of the linear part (in light, and in code), offset, exponent.
-SLOPE, TOE, KNEE, OFFSET, EXPONENT = 12.92, 0.0031308, 0.04045, 0.055, 2.4
+Values: TypeAlias = NDArray[Any]
 
 # SMPTE ST 2084, 5.2 (PQ): its constants, and the light of code 1 in cd/m2.
 PQ_M1, PQ_M2 = 2610 / 16384, 2523 / 4096 * 128
@@ -28,15 +28,13 @@ BT1886_EXPONENT = 2.4
 
 
 def decode_srgb(code: Values) -> Values:
-    """Return the light of sRGB codes; below 0 the linear part goes on, above 1 the power."""
-    power = ((np.maximum(code, KNEE) + OFFSET) / (1 + OFFSET)) ** EXPONENT
-    return np.where(code <= KNEE, code / SLOPE, power)
+    """Return the light of sRGB codes, as a display has it; below 0 the linear part goes on."""
+    return display.decode_srgb(torch.from_numpy(np.ascontiguousarray(code))).numpy()
 
 
 def encode_srgb(light: Values) -> Values:
     """Return the sRGB codes of light, not clipped."""
-    power = (1 + OFFSET) * np.maximum(light, TOE) ** (1 / EXPONENT) - OFFSET
-    return np.where(light <= TOE, SLOPE * light, power)
+    return display.encode_srgb(torch.from_numpy(np.ascontiguousarray(light))).numpy()
 
 
 def decode_gamma(code: Values, exponent: float) -> Values:
