@@ -38,7 +38,7 @@ from benchmarks.thresholds import (
 )
 from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar
 from torch_vdm.cortex import Cortex, Transform, bands
-from torch_vdm.masking import masking_energy, signed_transducer
+from torch_vdm.masking import unmasked
 from torch_vdm.pooling import covering, phase_energy, pool_halves, surround_halves
 from torch_vdm.quadtree import push
 from torch_vdm.vdm import _band_contrast, _band_sensitivity
@@ -207,14 +207,16 @@ class _Coefficients:
         ]
 
     def pooled(self, weighted: Tensor) -> Tensor:
-        """Return the pooled energy (B, C, orientations, h, w) of the responses to contrasts."""
-        response = signed_transducer(weighted, self.exponent, masking_energy(weighted))
-        energy = phase_energy(response, self.transform.phases)
+        """Return the energy (B, C, orientations, h, w) of contrasts, pooled and masked."""
+        energy = phase_energy(weighted, self.transform.phases)
+        planes = torch.cat((energy, (weighted * weighted).sum(2, keepdim=True)), 2)
         if self.transform.shifts > 1:
-            around = surround_halves(energy, 3)
-            return pool_halves(pool_halves(around, 3, -1), 3, -2) / covering(3)
-        around = functional.pad(energy, (*self.sides, 0, 0), mode="replicate")
-        return functional.avg_pool3d(around, (1, 3, 3), 1)
+            around = surround_halves(planes, 3)
+            pooled = pool_halves(pool_halves(around, 3, -1), 3, -2) / covering(3)
+        else:
+            around = functional.pad(planes, (*self.sides, 0, 0), mode="replicate")
+            pooled = functional.avg_pool3d(around, (1, 3, 3), 1)
+        return pooled[:, :, :-1] * torch.exp2(unmasked(pooled[:, :, -1:], self.exponent))
 
     def at_largest(self, details: list[Tensor], gain: Tensor) -> list[Tensor]:
         """Return what the largest place of the map pools, (bands or 1, orientations, n, n) a level.
@@ -322,9 +324,10 @@ class Model:
 
     def _power(self, contrast: Tensor) -> Tensor:
         """Return the power (..., orientations) of contrasts (B, ., orientations, 1, nodes)."""
-        response = signed_transducer(contrast, self.exponent, masking_energy(contrast))
-        energy = phase_energy(response, self.transform.phases)
-        return energy.mean((-2, -1)) ** (0.5 * self.observer.summation_exponent)
+        energy = phase_energy(contrast, self.transform.phases).mean((-2, -1))
+        masks = (contrast * contrast).sum(2, keepdim=True).mean((-2, -1))
+        left = energy * torch.exp2(unmasked(masks, self.exponent))
+        return left ** (0.5 * self.observer.summation_exponent)
 
     def log_score(self, gain: list[Tensor], times: Tensor) -> tuple[Tensor, Tensor]:
         """Return the logarithm of the score, mean over the drawings, and its slope; (rows,)."""
@@ -350,15 +353,14 @@ class Model:
         weights = (gain[..., 0] * torch.exp(times).view(-1, 1, 1)).to(table)
         contrast = torch.einsum("rlbon,rbc->rclon", table[self.pattern_of], weights)
         half = 0.5 * self.observer.summation_exponent
-        mask = (contrast * contrast).sum(3, keepdim=True)
+        energy = (contrast * contrast).mean(-1)
+        masks = energy.sum(3, keepdim=True)
         exponent = self.exponent.to(table)
-        response = signed_transducer(contrast, exponent, mask)
-        # Of the logarithm of a response by that of the contrast.
-        rise = 1.0 - 2.0 * exponent * mask / (1.0 + mask)
-        energy = (response * response).mean(-1)
-        by_times = 2.0 * (response * response * rise).mean(-1)
-        total = (energy**half).sum((1, 2, 3)).double().clamp_min(1e-300)
-        slope = (half * energy ** (half - 1.0) * by_times).sum((1, 2, 3)).double() / total
+        power = (energy * torch.exp2(unmasked(masks, exponent))) ** half
+        # Of the logarithm of the power by that of the contrast.
+        rise = 2.0 * half * (1.0 - 2.0 * exponent * masks / (1.0 + masks))
+        total = power.sum((1, 2, 3)).double().clamp_min(1e-300)
+        slope = (power * rise).sum((1, 2, 3)).double() / total
         return torch.log(total), slope.detach()
 
     def residual(self, free: dict[str, Tensor]) -> Tensor:

@@ -1,7 +1,7 @@
 """One coefficient from light to JND with 50 digits, beside the metric's own stages in float64.
 
 What a float64 reference cannot show: that the stages lose nothing themselves. Local contrast,
-opponents, contrast sensitivity, transducer, difference and root, from the formulas.
+opponents, contrast sensitivity, masking, difference and root, from the formulas.
 """
 
 from collections.abc import Sequence
@@ -93,9 +93,14 @@ def _exact(
             for channel, row in enumerate(SML_TO_OPPONENTS):
                 mixed = sum(mpf(w) * contrast for w, contrast in zip(row, contrasts, strict=True))
                 weighted[channel].append(sensitivities[channel] * mixed)
-        responses.append([_transduced(observer, v, of) for of in weighted for v in of])
+        responses.append(weighted)
     exponent = mpf(observer.summation_exponent)
-    total = sum(abs(one - other) ** exponent for one, other in zip(*responses, strict=True))
+    # One channel's orientations of one image and of the other.
+    total = sum(
+        difference**exponent
+        for one, other in zip(*responses, strict=True)
+        for difference in _differences(observer, one, other)
+    )
     # One node: its 3x3 mean is itself.
     return total ** (1 / mpf(observer.summation_exponent))
 
@@ -128,10 +133,16 @@ def _sensitivities(observer: Observer, frequency: Any, luminance: Any) -> list[A
     return [achromatic, *(value * dark ** -o["chromatic_dimming"] for value in chromatic)]
 
 
-def _transduced(observer: Observer, weighted: Any, masks: list[Any]) -> Any:
-    """Return the response to a weighted contrast, 1 at threshold, beside all that mask it."""
-    if observer.signed:
-        q = mpf(observer.transducer_exponent)
-        return 2**q * weighted * (1 + sum(v**2 for v in masks)) ** -q
-    energy = weighted**2
-    return 2 * energy ** mpf("1.125") / (energy ** mpf("1.025") + 1)
+def _differences(observer: Observer, first: list[Any], second: list[Any]) -> list[Any]:
+    """Return the differences of weighted contrasts, one an orientation, 1 at threshold."""
+    if not observer.signed:
+        first, second = (
+            [2 * v ** mpf("2.25") / (v ** mpf("2.05") + 1) for v in map(abs, image)]
+            for image in (first, second)
+        )
+        return [abs(one - other) for one, other in zip(first, second, strict=True)]
+    q = mpf(observer.transducer_exponent)
+    masks = sum(v**2 for v in first + second)
+    return [
+        abs(one - other) * (2 / (1 + masks)) ** q for one, other in zip(first, second, strict=True)
+    ]

@@ -26,12 +26,12 @@ def test_eq_5_is_the_reference() -> None:
 
 @pytest.mark.parametrize("exponent", [2.4, 6.0])
 def test_of_energies_it_is_that_of_their_roots(exponent: float) -> None:
-    # As many as are summed up in an energy: their mean counts.
+    # What is left of an energy is told in octaves: here a quarter.
     energy = np.random.default_rng(3).uniform(size=(3, 3, 5, 6))
     energy[0, 0, :2] = 0.0
     expected = paper.local_visual_difference(np.sqrt(energy / 4.0), exponent)
     actual = local_visual_difference_of_energy(
-        torch.from_numpy(energy)[None], 4.0, torch.tensor(exponent, dtype=torch.float64)
+        torch.from_numpy(energy)[None], torch.tensor(exponent, dtype=torch.float64), -2.0
     )
     np.testing.assert_allclose(actual[0, 0].numpy(), expected, rtol=1e-12)
 

@@ -142,7 +142,7 @@ def test_orders_images_as_the_map_does_near_threshold() -> None:
     x = torch.arange(48.0)
     noise = torch.randn(reference.shape, generator=torch.Generator().manual_seed(4))
     patterns = [torch.sin(x / n).expand_as(reference) for n in (1.0, 2.0, 5.0)] + [noise]
-    tests = [reference + a * p for p in patterns for a in np.geomspace(0.001, 0.012, 7).tolist()]
+    tests = [reference + a * p for p in patterns for a in np.geomspace(0.001, 0.03, 7).tolist()]
     jnd = [VDM()(test, reference).mean().item() for test in tests]
     assert 0.02 < min(jnd) < 1.0 < max(jnd) < 5.0
     for weight, least in ((0.0, 0.98), (120.0, 0.9)):

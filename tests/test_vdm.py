@@ -321,7 +321,8 @@ def test_effects_that_are_off_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> N
         "vdm.attenuation",
         "vdm.butterworth",
         "vdm.surround",
-        "response.signed_transducer",
+        "vdm.unmasked",
+        "response.masking_energy",
         "gradient.surround",
     ):
         monkeypatch.setattr(f"torch_vdm.{name}", forbidden)

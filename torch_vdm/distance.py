@@ -1,5 +1,6 @@
 """Distance summation, the last box of Fig. 2: Quick's vector sum over channels and levels."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -46,15 +47,18 @@ def local_visual_difference(difference: Tensor, exponent: Tensor) -> Tensor:
     return (size * size * rest).sum((1, 2)).unsqueeze(1)
 
 
-def local_visual_difference_of_energy(energy: Tensor, count: float, exponent: Tensor) -> Tensor:
+def local_visual_difference_of_energy(
+    energy: Tensor, exponent: Tensor, left: Tensor | float = 0.0
+) -> Tensor:
     """Return the local visual difference of squared differences: their power of exponent / 2.
 
-    Arguments as `local_visual_difference`, whose square ``energy`` is the sum over ``count`` of.
+    Arguments as `local_visual_difference`, whose square is the ``energy`` times 2^``left``.
     """
-    energy = energy.clamp_max(LARGEST_DIFFERENCE**2 * count)
-    rest = torch.exp2((0.5 * exponent - 1.0) * torch.log2(energy.clamp_min(SMALLEST_DIFFERENCE)))
-    # Divided when there is one plane left.
-    return (energy * rest).sum((1, 2)).unsqueeze(1) / count ** (0.5 * exponent)
+    octaves = torch.log2(energy.clamp_min(SMALLEST_DIFFERENCE))
+    seen = (octaves + left).clamp_max(2.0 * math.log2(LARGEST_DIFFERENCE))
+    # The energy times what is left of its power: exactly 0 at 0.
+    power = energy * torch.exp2(0.5 * exponent * seen - octaves)
+    return power.sum((1, 2)).unsqueeze(1)
 
 
 class Paths(NamedTuple):

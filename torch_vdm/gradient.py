@@ -41,7 +41,7 @@ def local_difference(
     matrix
         (channels, 3), of Eq. 3.
     masking, summation
-        The exponents of `signed_transducer` and of `local_visual_difference`.
+        The exponents of `unmasked` and of `local_visual_difference`.
     """
     around = function, matrix, masking, summation
     local: Tensor = _LocalDifference.apply(*around, details, *sight, others, *other_sight)
@@ -102,77 +102,59 @@ def _slopes(
     summation: Tensor,
 ) -> list[Tensor | None]:
     """Return the slopes by those of the ``images`` that are ``wanted``."""
-    wanted_of = wanted[:3], wanted[3:]
-    one, other = (
-        _respond(image, matrix, masking, any(slopes))
-        for image, slopes in zip((images[:3], images[3:]), wanted_of, strict=True)
-    )
-    slope = _by_difference(one.response - other.response, gradient, summation)
+    one, other = (_weighted(image, matrix) for image in (images[:3], images[3:]))
+    difference = one.weighted - other.weighted
+    energy = pool(surround(difference * difference))
+    masks = pool(surround(masking_energy(one.weighted, other.weighted))).add_(1.0)
+    # The energy times what `unmasked` leaves; then its power of half the summation.
+    gain = torch.log2(masks).sub_(1.0).mul_(-2.0 * masking).exp2_()
+    half = 0.5 * summation
+    energy.mul_(gain)
+    slope = torch.log2(energy.clamp_min(SMALLEST_DIFFERENCE)).mul_(half - 1.0).exp2_()
+    slope.mul_(gradient.unsqueeze(2) * half)
+    # With its repeated border the box is its own transpose. Squares have twice their root's slope.
+    hidden = (slope * energy).sum(2, keepdim=True).mul_(-2.0 * masking).div_(masks)
+    by_square = pool(surround(hidden)).mul_(2.0)
+    by_difference = pool(surround(slope.mul_(gain))).mul_(difference).mul_(2.0)
     return [
-        *_by_image(images[:3], one, slope, matrix, wanted_of[0]),
-        *_by_image(images[3:], other, slope.neg_(), matrix, wanted_of[1]),
+        *_by_image(images[:3], one, by_difference, by_square, matrix, wanted[:3]),
+        *_by_image(images[3:], other, by_difference.neg_(), by_square, matrix, wanted[3:]),
     ]
 
 
 class _Path(NamedTuple):
-    """What lies between the details of an image and its responses (B, channels, ., h, w)."""
+    """What lies between the details of an image and its weighted contrast, (B, 3, ., h, w)."""
 
-    response: Tensor
     contrast: Tensor
     opponent: Tensor
     weighted: Tensor
-    gain: Tensor
-    """(B, channels, 1, h, w): the response over the weighted contrast."""
-    fall: Tensor | None = None
-    """The same shape: 2 q / (1 + E), how the gain falls with what masks."""
 
 
-def _respond(image: Sequence[Tensor], matrix: Tensor, masking: Tensor, sloping: bool) -> _Path:
-    """Return the path of an image; the slope only where it is needed."""
+def _weighted(image: Sequence[Tensor], matrix: Tensor) -> _Path:
+    """Return the path of an image."""
     details, scale, sensitivity = image
     contrast = local_contrast(details, scale)
     opponent = opponents(contrast, matrix)
-    weighted = opponent * sensitivity
-    energy = masking_energy(weighted).add_(1.0)
-    # `signed_transducer`: v g, g = 2^(q (1 - log2(1 + E))).
-    gain = torch.log2(energy).sub_(1.0).mul_(-masking).exp2_()
-    if not sloping:
-        return _Path(weighted.mul_(gain), contrast, opponent, weighted, gain)
-    response = weighted * gain
-    return _Path(
-        response, contrast, opponent, weighted, gain, energy.reciprocal_().mul_(2.0 * masking)
-    )
-
-
-def _by_difference(difference: Tensor, gradient: Tensor, summation: Tensor) -> Tensor:
-    """Return the slope of the local visual difference by the difference of responses, signed."""
-    pooled = pool(surround(difference * difference))
-    # That of energy^(e / 2) is e / 2 energy^(e / 2 - 1), and that of the energy twice the root.
-    half = 0.5 * summation
-    slope = torch.log2(pooled.clamp_min(SMALLEST_DIFFERENCE)).mul_(half - 1.0).exp2_()
-    slope.mul_(gradient.unsqueeze(2) * summation)
-    # With its repeated border the box is its own transpose.
-    return pool(surround(slope)).mul_(difference)
+    return _Path(contrast, opponent, opponent * sensitivity)
 
 
 def _by_image(
     image: Sequence[Tensor],
     path: _Path,
-    slope: Tensor,
+    by_difference: Tensor,
+    by_square: Tensor,
     matrix: Tensor,
     wanted: Sequence[bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
     """Return the slopes by details, scale and sensitivity, of which those ``wanted`` are made.
 
-    From that by the response; takes the path's planes for its own.
+    From those by the weighted contrast, as far as it differs, and as far as it masks, over it.
+    Takes the path's planes for its own.
     """
     if not any(wanted):
         return None, None, None
     details, scale, sensitivity = image
-    assert path.fall is not None
-    # d R_o / d v_p = g (o = p) - 2 q / (1 + E) v_p R_o.
-    hidden = (slope * path.response).sum(2, keepdim=True).mul_(path.fall)
-    by_weighted = (slope * path.gain).sub_(path.weighted.mul_(hidden))
+    by_weighted = path.weighted.mul_(by_square).add_(by_difference)
     by_sensitivity = None
     if wanted[2]:
         by_sensitivity = path.opponent.mul_(by_weighted).sum_to_size(sensitivity.shape)

@@ -22,26 +22,32 @@ def energy_transducer(energy: Tensor) -> Tensor:
     return GAIN * numerator / (energy * torch.exp2((DENOMINATOR - 1.0) * octaves) + 1.0)
 
 
-def signed_transducer(contrast: Tensor, exponent: Tensor, energy: Tensor | None = None) -> Tensor:
-    """Return 2^q v / (1 + E)^q for a weighted contrast v (1 at threshold); psi(1) = 1 alone.
+def unmasked(masks: Tensor, exponent: Tensor) -> Tensor:
+    """Return what masking leaves of a squared signed difference, log2 of (2 / (1 + E))^(2q).
 
-    ``energy`` E is what masks, v^2 by default; see `masking_energy`.
+    Of one contrast v against none, pooled alone, it leaves the square of 2^q v / (1 + v^2)^q: 1 at
+    threshold and there alone, with a slope at 0 so that a loss moves from grey or black, and far
+    out v^(1 - 2q). On a pedestal increments are hidden in proportion to its power 2q, with q = 0.3
+    0.6 (Legge and Foley 1980). Status: choice.
 
-    Odd, so that a detail differs from its negative; its slope at 0 is 2^q, so that a loss moves
-    from grey or black; far out it grows as v^(1 - 2q), so that with q = 0.3 a strong contrast hides
-    increments in proportion to its power 0.6 (Legge and Foley 1980). Status: choice.
+    Parameters
+    ----------
+    masks
+        (B, channels, 1, h, w): E, what `masking_energy` gives of weighted contrast, 1 at threshold;
+        pooled as the difference is. A small spot is then spread as what hides it is: hidden by its
+        own centre, it would be seen 10 dB worse than people see it.
+    exponent
+        q.
     """
-    # Base 2 because a processor's own exponential is: (1 + E)^-q = 2^(-q log2(1 + E)).
-    energy = contrast * contrast if energy is None else energy
-    return contrast * torch.exp2(exponent * (1.0 - torch.log2(energy + 1.0)))
+    # A logarithm, in a processor's own base, for `local_visual_difference_of_energy` takes one.
+    return 2.0 * exponent * (1.0 - torch.log2(masks + 1.0))
 
 
-def masking_energy(contrast: Tensor) -> Tensor:
-    """Return what masks a weighted contrast, (B, C, 1, h, w): all orientations at its place.
+def masking_energy(first: Tensor, second: Tensor) -> Tensor:
+    """Return what masks the difference of two weighted contrasts: the energy of both.
 
-    ``contrast`` is (B, channels, orientations, h, w), even and odd ones of a pair among them. A
-    grating hides one at right angles to it as much as people say (Foley 1994, within 0.5 dB over
-    the threshold without a mask); the same direction alone would hide 12 dB less. Status: choice,
-    measured.
+    (B, channels, 1, h, w) from (B, channels, orientations, h, w), even and odd ones of a pair among
+    the orientations. A grating hides one at right angles to it (Foley 1994); the same direction
+    alone would hide 12 dB less. Status: choice, measured.
     """
-    return (contrast * contrast).sum(2, keepdim=True)
+    return (first * first).sum(2, keepdim=True) + (second * second).sum(2, keepdim=True)

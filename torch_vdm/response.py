@@ -9,8 +9,9 @@ from torch import Tensor
 from torch_vdm.contrast import adapted, local_contrast, opponents
 from torch_vdm.csf import bandpass
 from torch_vdm.grid import NONE, Before
-from torch_vdm.masking import energy_transducer, masking_energy, signed_transducer
+from torch_vdm.masking import energy_transducer, masking_energy
 from torch_vdm.matrix import mix
+from torch_vdm.pooling import phase_energy
 from torch_vdm.quadtree import push
 
 # The constants that the sensitivity in the local luminance depends on.
@@ -111,55 +112,71 @@ class Sight(NamedTuple):
         return Sight(self.scale, self.sensitivity[:, :, orientations])
 
 
-def response(
-    details: Tensor,
-    sight: Sight,
-    matrix: Tensor,
-    exponent: Tensor,
-    signed: bool,
-    masking: bool,
-) -> Tensor:
-    """Return the responses of one level of one image: local contrast to the transducer."""
+class Options(NamedTuple):
+    """What a level's responses and their difference depend on beside details and sights."""
+
+    matrix: Tensor
+    """(channels, 3), of Eq. 3."""
+    signed: bool
+    """As `Observer.signed`."""
+    masking: bool
+    """As `Effects.masking`."""
+    energies: bool
+    """Whether squares are pooled."""
+    phases: int
+    """As `Transform.phases`."""
+
+
+def response(details: Tensor, sight: Sight, options: Options) -> Tensor:
+    """Return the responses of one level of one image: local contrast to the transducer.
+
+    Signed ones are weighted contrast: what masks their difference is of both images.
+    """
     contrast = details
     if sight.scale is not None:
-        contrast = opponents(local_contrast(details, sight.scale), matrix)
+        contrast = opponents(local_contrast(details, sight.scale), options.matrix)
     weighted = contrast * sight.sensitivity
-    if signed:
-        if not masking:
-            return weighted
-        return signed_transducer(weighted, exponent, masking_energy(weighted))
-    return energy_transducer(weighted * weighted) if masking else weighted.abs()
+    if options.signed:
+        return weighted
+    return energy_transducer(weighted * weighted) if options.masking else weighted.abs()
+
+
+def difference_of(one: Tensor, other: Tensor, options: Options) -> Tensor:
+    """Return what is pooled of two images' responses at a level, (B, channels, n, h, w).
+
+    Their differences, or the energy of these, one for all phases of an orientation. Where signed
+    ones are masked, what masks them is the last of the n.
+    """
+    difference = one - other
+    if not options.energies:
+        return difference
+    energy = phase_energy(difference, options.phases)
+    if not (options.signed and options.masking):
+        return energy
+    return torch.cat((energy, masking_energy(one, other)), 2)
 
 
 def response_difference(
-    details: Tensor,
-    other_details: Tensor,
-    sight: Sight,
-    other_sight: Sight,
-    matrix: Tensor,
-    exponent: Tensor,
-    signed: bool,
-    masking: bool,
+    details: Tensor, other_details: Tensor, sight: Sight, other_sight: Sight, options: Options
 ) -> Tensor:
-    """Return the difference of two images' responses at a level.
+    """Return `difference_of` two images' responses at a level.
 
     Each image by itself: equal images then take equal paths through the vectorised loops, and
     their difference is exactly 0.
     """
-    options = matrix, exponent, signed, masking
-    return response(details, sight, *options) - response(other_details, other_sight, *options)
+    one, other = response(details, sight, options), response(other_details, other_sight, options)
+    return difference_of(one, other, options)
 
 
 def response_difference_at(
-    details: Tensor, other_details: Tensor, around: tuple[Any, ...], options: tuple[Any, ...]
+    details: Tensor, other_details: Tensor, around: tuple[Any, ...], options: Options
 ) -> Tensor:
     """Return `response_difference` where the parents are given for every node.
 
-    ``around`` is what `sights_of` takes, ``options`` what `response_difference` takes beside
-    details and sights.
+    ``around`` is what `sights_of` takes.
     """
     first, second = sights_of(*around)
-    return response_difference(details, other_details, first, second, *options)
+    return response_difference(details, other_details, first, second, options)
 
 
 def sights_of(

@@ -37,12 +37,12 @@ from torch_vdm.effects import Effects
 from torch_vdm.fast import SMALLEST, compiled, step
 from torch_vdm.gradient import by_hand, local_difference
 from torch_vdm.grid import Before, Grid
+from torch_vdm.masking import unmasked
 from torch_vdm.matrix import mix_row, product
 from torch_vdm.observer import Observer
 from torch_vdm.pair import Nonfinite, Numbers
 from torch_vdm.pooling import (
     covering,
-    phase_energy,
     pool,
     pool_halves,
     surround,
@@ -54,8 +54,10 @@ from torch_vdm.response import (
     OF_LUMINANCE,
     Level,
     Levels,
+    Options,
     Sight,
     adapted_luminance,
+    difference_of,
     response,
     response_difference,
     response_difference_at,
@@ -455,7 +457,8 @@ class VDM(TiledMetric):
     def respond(self, cortex: Cortex) -> tuple[Tensor, ...]:
         """Return the responses of one image: chromatic aberration to the transducer.
 
-        One (B, channels, orientations, h, w) a level, level 0 first; 1 is threshold.
+        One (B, channels, orientations, h, w) a level, level 0 first; 1 is threshold. Those of a
+        signed observer are weighted contrasts: what masks them is of the other image too.
         """
         constants = self._constants(cortex.mean.dtype)
         responses = []
@@ -463,7 +466,7 @@ class VDM(TiledMetric):
         for number, detail in enumerate(cortex.details):
             (sight,) = self._sights(levels.only(number), constants, [cortex], number)
             pushed = sight.pushed(_size(detail), before=cortex.before[number])
-            responses.append(response(detail, pushed, *self._options(constants)))
+            responses.append(response(detail, pushed, self._options(constants)))
         return tuple(responses)
 
     def lowpass_difference(self, first: Cortex, second: Cortex) -> Tensor:
@@ -501,11 +504,11 @@ class VDM(TiledMetric):
         responses = self.respond(first)
 
         def compare(second: Cortex) -> Tensor:
-            constants = self._constants(second.mean.dtype, "summation_exponent")
-            exponent = constants["summation_exponent"]
-            root = self.lowpass_difference(first, second) ** exponent
+            constants = self._constants(second.mean.dtype)
+            options = self._options(constants)
+            root = self.lowpass_difference(first, second) ** constants["summation_exponent"]
             local = tuple(
-                self._gathered(own - seen, exponent)
+                self._gathered(difference_of(own, seen, options), constants)
                 for own, seen in zip(responses, self.respond(second), strict=True)
             )
             return accumulate(local, root.sum(1, keepdim=True), before=first.before)
@@ -588,7 +591,7 @@ class VDM(TiledMetric):
         level, options = levels.in_a_row(nodes), self._options(constants)
         if self.transform.csf == "filter":
             sight = _weights_alone(level)
-            difference = response_difference(details[0], details[1], sight, sight, *options)
+            difference = response_difference(details[0], details[1], sight, sight, options)
         else:
             # Both images in one batch, where nothing is computed.
             images = first, second
@@ -609,8 +612,7 @@ class VDM(TiledMetric):
         # Beside one another along the longer side, where the least is left to fill up.
         along = -1 if sizes[-1][0] <= sizes[-1][1] else -2
         gather = compiled(_pooled_difference) if fast else _pooled_difference
-        exponent = constants["summation_exponent"]
-        gathered: Tensor = gather(_joined(around, along), *self._pooling(), exponent)
+        gathered: Tensor = gather(_joined(around, along), *self._pooling(constants))
         starts = itertools.accumulate((plane.shape[along] for plane in around), initial=0)
         local = []
         for start, plane, (rows, columns) in zip(starts, around, sizes, strict=False):
@@ -644,14 +646,15 @@ class VDM(TiledMetric):
         if apart and not fast and details.numel() > LARGEST_AT_ONCE:
             at_once = self.transform.phases
 
-        exponent, options = constants["summation_exponent"], self._options(constants)
+        options = self._options(constants)
 
         def gathered(one: Tensor, other: Tensor, sight: Sight, other_sight: Sight) -> Tensor:
-            difference = respond(one, other, sight, other_sight, *options)
-            return self._gathered(difference, exponent, fast, items)
+            difference = respond(one, other, sight, other_sight, options)
+            return self._gathered(difference, constants, fast, items)
 
         # Where the gradient is known by hand, nothing needs to be kept.
-        fixed = *options[:2], exponent
+        names = "opponents", "transducer_exponent", "summation_exponent"
+        fixed = tuple(constants[name] for name in names)
         known = (
             by_hand()
             and self.observer.signed
@@ -679,41 +682,54 @@ class VDM(TiledMetric):
                 local.append(self._kept(gathered, *arguments))
         return torch.stack(local).sum(0) if len(local) > 1 else local[0]
 
-    def _options(self, constants: dict[str, Tensor]) -> tuple[Tensor, Tensor, bool, bool]:
-        """Return what `response` takes beside details and sight."""
-        return (
+    def _options(self, constants: dict[str, Tensor]) -> Options:
+        overlapping = self.transform.shifts > 1
+        return Options(
             constants["opponents"],
-            constants["transducer_exponent"],
             self.observer.signed,
             self.effects.masking,
+            # Neighbouring responses with signs would cancel, and of overlapping nodes and of
+            # quadrature pairs the energy hardly depends on the phase of a grating.
+            self.observer.signed or overlapping,
+            self.transform.phases,
         )
 
     def _gathered(
-        self, difference: Tensor, exponent: Tensor, fast: bool = False, items: int = 1
+        self,
+        difference: Tensor,
+        constants: dict[str, Tensor],
+        fast: bool = False,
+        items: int = 1,
     ) -> Tensor:
-        """Return the local visual difference of response differences, after spatial pooling."""
+        """Return the local visual difference of `difference_of`, after spatial pooling."""
         gather = compiled(_pooled_difference) if fast else _pooled_difference
         surrounded = self._surrounded(difference, fast, items)
-        local: Tensor = gather(surrounded, *self._pooling(), exponent)
+        local: Tensor = gather(surrounded, *self._pooling(constants))
         return within(local, difference.shape[-2], items)
 
     def _surrounded(self, difference: Tensor, fast: bool = False, items: int = 1) -> Tensor:
-        """Return response differences with the neighbours that `_pooled_difference` takes."""
-        energies, overlapping, nodes = self._pooling()
-        energy = compiled(phase_energy) if fast else phase_energy
-        if energies:
-            difference = energy(difference, self.transform.phases)
-        if not overlapping:
+        """Return `difference_of` with the neighbours that `_pooled_difference` takes."""
+        nodes = self._pooled_nodes
+        if self.transform.shifts == 1:
             return surround(difference, items) if nodes > 1 else difference
         rows = compiled(pool_halves) if fast else pool_halves
         pooled: Tensor = rows(surround_halves(difference, nodes), nodes, -1)
         return pooled
 
-    def _pooling(self) -> tuple[bool, bool, int]:
-        """Return whether energies are pooled, whether nodes overlap, and how many in a row."""
-        overlapping = self.transform.shifts > 1
-        nodes = 3 if self.effects.pooling else 1
-        return self.observer.signed or overlapping, overlapping, nodes
+    @property
+    def _pooled_nodes(self) -> int:
+        """How many nodes in a row are pooled."""
+        return 3 if self.effects.pooling else 1
+
+    def _pooling(self, constants: dict[str, Tensor]) -> tuple[Options, bool, int, Tensor, Tensor]:
+        """Return what `_pooled_difference` takes beside the differences."""
+        return (
+            self._options(constants),
+            self.transform.shifts > 1,
+            self._pooled_nodes,
+            constants["transducer_exponent"],
+            constants["summation_exponent"],
+        )
 
     def _sights(
         self,
@@ -866,18 +882,28 @@ def _band_contrast(
 
 
 def _pooled_difference(
-    surrounded: Tensor, energies: bool, overlapping: bool, nodes: int, exponent: Tensor
+    surrounded: Tensor,
+    options: Options,
+    overlapping: bool,
+    nodes: int,
+    masking: Tensor,
+    summation: Tensor,
 ) -> Tensor:
-    """Return the local visual difference of response differences, pooled over ``nodes`` nodes.
+    """Return the local visual difference of `difference_of`, pooled over ``nodes`` nodes.
 
-    Their neighbours are given. Printed responses are pooled as a difference, for pooling is
-    linear; signed ones come as squares, for neighbours alternate and would cancel; those of
-    overlapping nodes as squares that are pooled along rows.
+    Their neighbours are given; those of overlapping nodes are pooled along rows. Printed responses
+    are pooled as a difference, for pooling is linear; others come as squares.
     """
+    count = 1.0
     if overlapping:
-        energy = pool_halves(surrounded, nodes, -2)
-        return local_visual_difference_of_energy(energy, covering(nodes), exponent)
-    pooled = pool(surrounded) if nodes > 1 else surrounded
-    if energies:
-        return local_visual_difference_of_energy(pooled, 1.0, exponent)
-    return local_visual_difference(pooled, exponent)
+        pooled, count = pool_halves(surrounded, nodes, -2), covering(nodes)
+    else:
+        pooled = pool(surrounded) if nodes > 1 else surrounded
+    if not options.energies:
+        return local_visual_difference(pooled, summation)
+    # The sums of overlapping nodes are divided where it costs least.
+    left: Tensor | float = -math.log2(count)
+    if options.signed and options.masking:
+        left = unmasked(pooled[:, :, -1:] / count, masking) + left
+        pooled = pooled[:, :, :-1]
+    return local_visual_difference_of_energy(pooled, summation, left)

@@ -56,7 +56,7 @@ class CalibratedParameters:
     yellow_violet_gain, yellow_violet_cutoff, yellow_violet_order
         The same for C2.
     transducer_exponent
-        q of the signed transducer; no unit.
+        q of masking; no unit.
     summation_exponent
         In the place of Eq. 5's 2.4; no unit.
     lowpass_gains
@@ -93,9 +93,9 @@ class CalibratedParameters:
 
 @dataclass(frozen=True)
 class SignedResponses:
-    """What each stage from local contrast to the transducer returns, one array a level.
+    """What each stage from local contrast to CSF filtering returns, one array a level.
 
-    Pooling follows on the difference of two images, in `compare`.
+    Pooling and masking follow, of two images, in `compare`.
 
     Attributes
     ----------
@@ -107,15 +107,12 @@ class SignedResponses:
         Local luminance (h, w), cd/m2.
     weighted
         v, contrast times sensitivity over the level's gain (3, C, h, w), signed; 1 at threshold.
-    response
-        psi(v) (3, C, h, w), signed; 1 at threshold.
     """
 
     contrast: tuple[Array, ...]
     opponent: tuple[Array, ...]
     luminance: tuple[Array, ...]
     weighted: tuple[Array, ...]
-    response: tuple[Array, ...]
 
 
 # The grid of nodes
@@ -421,36 +418,44 @@ def csf_filtering(
 # Masking transducer
 
 
-def transducer(v: float, energy: float, exponent: float) -> float:
-    """Signed, for Eq. 4: psi = 2^q v (1 + E)^(-q), q = ``exponent``; 1 where v and E are."""
-    return float(2**exponent * v * (1 + energy) ** -exponent)
+def transducer(energy: float, masks: float, exponent: float) -> float:
+    """Signed, for Eq. 4: D (2 / (1 + E))^(2q) of the squared difference D, q = ``exponent``.
+
+    1 where a contrast of 1 differs from none: D and E are 1.
+    """
+    return float(energy * (2 / (1 + masks)) ** (2 * exponent))
 
 
-def masking_transducer(
-    weighted: Array, effects: Effects, parameters: CalibratedParameters
+def masked_differences(
+    test: Array, reference: Array, effects: Effects, parameters: CalibratedParameters
 ) -> Array:
-    """Transducer psi on one level, signed, 1 at threshold.
+    """Spatial pooling and masking transducer of one level: squared differences, 1 at threshold.
 
-    What masks a contrast is the sum of v^2 over all orientations of its channel at its node.
+    (v_1 - v_2)^2 is pooled, because signed contrasts of neighbours alternate and would cancel. What
+    masks it is the sum of v_1^2 + v_2^2 over all orientations of its channel, pooled alike.
 
     Parameters
     ----------
-    weighted
+    test, reference
         v, (orientations, C, h, w), signed; 1 at threshold.
     effects
-        Without ``masking`` the identity.
+        Without ``masking`` nothing masks.
     parameters
         The observer's numbers.
     """
+    energy = spatial_pooling((test - reference) ** 2, effects)
     if not effects.masking:
-        return weighted
-    response = np.zeros(weighted.shape)
-    for theta, channel, y, x in np.ndindex(weighted.shape):
-        energy = sum(float(v) ** 2 for v in weighted[:, channel, y, x])
-        response[theta, channel, y, x] = transducer(
-            float(weighted[theta, channel, y, x]), energy, parameters.transducer_exponent
+        return energy
+    squares = (test**2 + reference**2).sum(axis=0, keepdims=True)
+    masks = spatial_pooling(squares, effects)
+    left = np.zeros(energy.shape)
+    for theta, channel, y, x in np.ndindex(energy.shape):
+        left[theta, channel, y, x] = transducer(
+            float(energy[theta, channel, y, x]),
+            float(masks[0, channel, y, x]),
+            parameters.transducer_exponent,
         )
-    return response
+    return left
 
 
 # Charging
@@ -643,7 +648,7 @@ def represent(
 def respond(
     pyramid: Pyramid, ppd: float, parameters: CalibratedParameters, effects: Effects = ALL_ON
 ) -> SignedResponses:
-    """Local contrast to masking transducer (Fig. 2) of one image's representation."""
+    """Local contrast to CSF filtering (Fig. 2) of one image's representation."""
     levels = len(pyramid.details)
     dark_light = parameters.dark_light
     contrast = tuple(local_contrast(pyramid, level, dark_light) for level in range(levels))
@@ -654,8 +659,7 @@ def respond(
         f = level_frequency(level, levels, ppd)
         _, peak_gain = wavelet_peak(half_width(level, levels))
         weighted.append(csf_filtering(opponent[level], f, peak_gain, luminance[level], parameters))
-    response = tuple(masking_transducer(plane, effects, parameters) for plane in weighted)
-    return SignedResponses(contrast, opponent, luminance, tuple(weighted), response)
+    return SignedResponses(contrast, opponent, luminance, tuple(weighted))
 
 
 def compare(
@@ -664,10 +668,9 @@ def compare(
     parameters: CalibratedParameters,
     effects: Effects = ALL_ON,
 ) -> tuple[Array, ...]:
-    """Spatial pooling of (R_1 - R_2)^2, then Eq. 5 of its root: D of every node.
+    """`masked_differences`, then Eq. 5 of their root: D of every node.
 
-    One (h, w) a level, that of the root first. The square is pooled because signed responses of
-    neighbours alternate and would cancel.
+    One (h, w) a level, that of the root first.
 
     Returns
     -------
@@ -676,9 +679,9 @@ def compare(
     """
     return tuple(
         local_visual_difference(
-            np.sqrt(spatial_pooling((r1 - r2) ** 2, effects)), parameters.summation_exponent
+            np.sqrt(masked_differences(v1, v2, effects, parameters)), parameters.summation_exponent
         )
-        for r1, r2 in zip(test.response, reference.response, strict=True)
+        for v1, v2 in zip(test.weighted, reference.weighted, strict=True)
     )
 
 

@@ -18,11 +18,12 @@ from .calibrated import (
     grid_of,
     inherited_share,
     lowpass_term,
-    masking_transducer,
+    masked_differences,
     own_share,
     sensitivity,
     squared_change,
     sum_down_paths,
+    transducer,
 )
 from .calibrated import nearest as at
 from .paper import (
@@ -36,7 +37,6 @@ from .paper import (
     cone_fundamentals,
     level_count,
     local_visual_difference,
-    spatial_pooling,
     wavelet_peak,
 )
 from .sarnoff import BURT, correlate, transfer
@@ -337,14 +337,14 @@ def box_over_shifts(energy: Array, nodes: int) -> Array:
     return pooled
 
 
-def level_responses(
+def weighted_levels(
     image: Array,
     ppd: float,
     kind: str,
     peaks: list[tuple[float, float]],
     parameters: CalibratedParameters,
 ) -> list[Array]:
-    """Return the signed responses (orientations, 3, h, w) of every level, the finest first.
+    """Return v (orientations, 3, h, w) of every level, the finest first.
 
     ``peaks`` are frequency, cycles/pixel, and gain of every level, for d3 those of `diagonal_peak`.
     """
@@ -355,7 +355,7 @@ def level_responses(
             weighted = np.stack([channel[level][0] for channel in planes], axis=1)
             weighted /= wavelet_peak(2**level)[1]
             weighted[2] /= diagonal_share()
-            responses.append(masking_transducer(weighted, ALL_ON, parameters))
+            responses.append(weighted)
         return responses
     cones = cone_fundamentals(image)
     dark = cone_dark_light(parameters.dark_light)
@@ -385,7 +385,7 @@ def level_responses(
                 opponent = SML_TO_OPPONENT @ contrast[orientation]
                 seen = np.array(sensitivity(ppd * f, luminance, parameters))
                 weighted[orientation, :, y, x] = opponent * seen / g
-        responses.append(masking_transducer(weighted, ALL_ON, parameters))
+        responses.append(weighted)
     return responses
 
 
@@ -397,14 +397,29 @@ def pair_differences(
     peaks: list[tuple[float, float]],
     parameters: CalibratedParameters,
 ) -> list[Array]:
-    """Return the squared differences (orientations, 3, h, w); of even and odd, their mean."""
+    """Return the squared differences (orientations, 3, h, w) of every level, pooled and masked.
+
+    Of even and odd, their mean.
+    """
     first, second = (
-        level_responses(image, ppd, kind, peaks, parameters) for image in (test, reference)
+        weighted_levels(image, ppd, kind, peaks, parameters) for image in (test, reference)
     )
-    squares = [(one - other) ** 2 for one, other in zip(first, second, strict=True)]
-    if kind == "steerable":
-        squares = [0.5 * (square[0::2] + square[1::2]) for square in squares]
-    return squares
+    levels = []
+    for one, other in zip(first, second, strict=True):
+        squares = (one - other) ** 2
+        if kind == "steerable":
+            squares = 0.5 * (squares[0::2] + squares[1::2])
+        masks = (one**2 + other**2).sum(axis=0)
+        left = np.zeros(squares.shape)
+        for orientation, channel in np.ndindex(squares.shape[:2]):
+            pooled = box_over_shifts(squares[orientation, channel], 3)
+            around = box_over_shifts(masks[channel], 3)
+            for y, x in np.ndindex(pooled.shape):
+                left[orientation, channel, y, x] = transducer(
+                    float(pooled[y, x]), float(around[y, x]), parameters.transducer_exponent
+                )
+        levels.append(left)
+    return levels
 
 
 def changes_of_halves(
@@ -419,7 +434,7 @@ def changes_of_halves(
     test, reference
         Cone images (3, H, W), cd/m2.
     kind, peaks
-        As in `level_responses`.
+        As in `weighted_levels`.
     """
     changes = []
     for level in range(level_count(*test.shape[1:])):
@@ -456,8 +471,7 @@ def jnd_map(
         square = squares[level]
         local = np.zeros(square.shape[2:])
         for orientation, channel in np.ndindex(square.shape[:2]):
-            pooled = box_over_shifts(square[orientation, channel], 3)
-            local += pooled ** (0.5 * parameters.summation_exponent)
+            local += square[orientation, channel] ** (0.5 * parameters.summation_exponent)
         ratios = change_ratios(changes[level], 2)
         for y, x in np.ndindex(height, width):
             half = y // 2**level, x // 2**level
@@ -507,11 +521,12 @@ def filtered_haar_map(
             finer = len(details) - 1 - level
             weighted = plane / wavelet_peak(2**finer)[1]
             weighted[2] /= diagonal_share()
-            levels.append(masking_transducer(weighted, ALL_ON, parameters))
+            levels.append(weighted)
         responses.append(levels)
     lvd = tuple(
         local_visual_difference(
-            np.sqrt(spatial_pooling((one - other) ** 2, ALL_ON)), parameters.summation_exponent
+            np.sqrt(masked_differences(one, other, ALL_ON, parameters)),
+            parameters.summation_exponent,
         )
         for one, other in zip(*responses, strict=True)
     )
