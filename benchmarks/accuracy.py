@@ -30,7 +30,7 @@ from benchmarks.speed import images, peak_megabytes
 from benchmarks.thresholds import Threshold, pattern, read_thresholds, render, sampling
 from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar
 from torch_vdm.cli import TRANSFORMS
-from torch_vdm.cortex import Transform
+from torch_vdm.model.cortex import Transform
 
 Array = NDArray[np.float64]
 

@@ -37,11 +37,11 @@ from benchmarks.thresholds import (
     sampling,
 )
 from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar
-from torch_vdm.cortex import Cortex, Transform, bands
-from torch_vdm.masking import unmasked
-from torch_vdm.pooling import covering, phase_energy, pool_halves, surround_halves
-from torch_vdm.quadtree import push
-from torch_vdm.vdm import _band_contrast, _band_sensitivity
+from torch_vdm.model.cortex import Cortex, Transform, bands
+from torch_vdm.model.filtering import band_contrast, band_sensitivity
+from torch_vdm.model.masking import unmasked
+from torch_vdm.model.pooling import covering, phase_energy, pool_halves, surround_halves
+from torch_vdm.model.quadtree import push
 
 MECHANISMS = ("achromatic", "red-green", "yellow-violet", "mixed")
 
@@ -129,17 +129,17 @@ class _Responses(nn.Module):
         return torch.stack([r[..., 0, 0] for r in reversed(self.metric.respond(cortex))], 1)
 
     def _of_bands(self, plane: Tensor, detail: Tensor) -> Tensor:
-        constants = self.metric._constants(detail.dtype)
-        passed = self.metric._passed(constants["band_frequencies"], constants)
-        weights, local = self.metric._band_weights(constants)
-        assert local is not None
+        model = self.metric.model(detail.dtype)
+        passed, weights, table = model.band_weights()
+        assert table is not None
+        constants = dict(model.constants)
         eye = constants["dark_cones"], constants["opponents"]
         found = []
         for band in range(LEVELS + 1):
             some = slice(band, band + 1)
-            at_places = _band_sensitivity(plane, torch.cat((local[some], local[-1:])), constants)
+            at_places = band_sensitivity(plane, torch.cat((table[some], table[-1:])), constants)
             weighing = passed[some], weights[:, some], at_places
-            found.append(_band_contrast((detail,), plane, *weighing, *eye)[..., 0])
+            found.append(band_contrast(plane, (detail,), *weighing, *eye)[..., 0])
         return torch.stack(found, 1)
 
 

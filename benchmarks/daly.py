@@ -13,7 +13,7 @@ import math
 import torch
 from torch import Tensor
 
-from torch_vdm.display import BT709_TO_XYZ, Display
+from torch_vdm.model.display import BT709_TO_XYZ, Display
 
 # Contrast sensitivity: peak, eccentricity, size and orientation terms. Status: source.
 PEAK, EPSILON = 250.0, 0.9

@@ -12,9 +12,9 @@ import torch
 from mpmath import mpf
 
 from torch_vdm import VDM, Observer
-from torch_vdm.cones import XYZ_TO_SML
-from torch_vdm.contrast import SML_TO_OPPONENTS
-from torch_vdm.cortex import Cortex
+from torch_vdm.model.cones import XYZ_TO_SML
+from torch_vdm.model.contrast import SML_TO_OPPONENTS
+from torch_vdm.model.cortex import Cortex
 
 DIGITS = 50
 

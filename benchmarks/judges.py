@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_vdm import VDM, Display
-from torch_vdm.display import encode_srgb
+from torch_vdm.model.display import encode_srgb
 
 Judge = Callable[[Tensor, Tensor], dict[str, float]]
 

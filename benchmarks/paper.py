@@ -39,7 +39,7 @@ from benchmarks.record import caption, circumstances, save
 from benchmarks.scenes import STILL_LIFE, scene_file, sized
 from sampling import Sampler, Settings, rounds
 from sampling.renderers.mitsuba import MitsubaRenderer
-from torch_vdm.display import encode_srgb
+from torch_vdm.model.display import encode_srgb
 
 Plane = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.display import BT709_TO_XYZ, encode_srgb
+from torch_vdm.model.display import BT709_TO_XYZ, encode_srgb
 
 # White of the display of a peer that knows no luminance, over the background. Status: choice.
 WHITE = 4.0

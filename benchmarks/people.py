@@ -17,7 +17,7 @@ from benchmarks import record
 from benchmarks.places import shared_data
 from benchmarks.thresholds import D65
 from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, read_image
-from torch_vdm.cortex import Transform
+from torch_vdm.model.cortex import Transform
 
 Array = NDArray[np.float64]
 

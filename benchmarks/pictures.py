@@ -20,7 +20,7 @@ from benchmarks import record
 from benchmarks.calibrate import RUNGS
 from benchmarks.places import shared_data
 from torch_vdm import VDM, Display, read_image
-from torch_vdm.display import decode_srgb, encode_srgb
+from torch_vdm.model.display import decode_srgb, encode_srgb
 
 # The side of a picture in pixels, and its first row and column in a photograph.
 SIDE, CORNER = 256, 100

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from benchmarks.exact import DIGITS, largest_error
 from benchmarks.record import blank_figure, caption, circumstances, save
 from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar, Steerable, VDMLoss
-from torch_vdm.cortex import Transform
+from torch_vdm.model.cortex import Transform
 
 SIZE = (24, 31)
 DTYPES = {

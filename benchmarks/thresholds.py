@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torch_vdm.cones import XYZ_TO_SML
+from torch_vdm.model.cones import XYZ_TO_SML
 
 TABLE = Path(__file__).parent / "data" / "contrast_thresholds.csv"
 

@@ -27,8 +27,8 @@ from benchmarks.places import CACHE
 from benchmarks.record import blank_figure, caption, circumstances, save
 from benchmarks.renders import Picture, held_out_scenes, picture, training_scenes
 from torch_vdm import VDM, Display, VDMLoss
-from torch_vdm.display import encode_srgb
 from torch_vdm.io import atomic_path
+from torch_vdm.model.display import encode_srgb
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from benchmarks.renders import CHANNELS, Picture
-from torch_vdm.display import decode_srgb, encode_srgb
+from torch_vdm.model.display import decode_srgb, encode_srgb
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.cortex import Cortex, Haar
-from torch_vdm.grid import Side
+from torch_vdm.model.cortex import Cortex, Haar
+from torch_vdm.model.grid import Side
 
 # Distance of the quartiles of a normal distribution from its mean, in standard deviations.
 QUARTILE = 0.6744897501960817

@@ -37,8 +37,8 @@ from torch_vdm.cli import (
     run,
     tell,
 )
-from torch_vdm.distance import VISIBLE
 from torch_vdm.io import atomic_path, write_channels
+from torch_vdm.model.distance import VISIBLE
 
 # Seconds between two checkpoints. Status: choice.
 CHECKPOINT_SECONDS = 30.0

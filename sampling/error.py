@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.grid import Grid
-from torch_vdm.quadtree import push
+from torch_vdm.model.grid import Grid
+from torch_vdm.model.quadtree import push
 
 
 def maximum(local: Sequence[Tensor], grid: Grid) -> tuple[Tensor, ...]:

@@ -20,9 +20,9 @@ from sampling.statistics import FIRST, SECOND, Statistics
 from sampling.tiles import LocalErrors, local_errors
 from sampling.variance import pooled_covariance
 from torch_vdm import VDM
-from torch_vdm.cortex import Cortex
-from torch_vdm.grid import Grid
-from torch_vdm.matrix import mix
+from torch_vdm.model.cortex import Cortex
+from torch_vdm.model.grid import Grid
+from torch_vdm.model.matrix import mix
 
 # Images that are simulated for one prediction: as many as have `SIMULATED` pixels together. The
 # maximum of a small image scatters more (10 to 20 % at 32x32, 5 % at 128x128), so that more are

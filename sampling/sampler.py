@@ -18,7 +18,7 @@ from sampling.statistics import FIRST, PIECE, SECOND, Statistics
 from sampling.strategies import LARGEST_GROWTH, SMALLEST_GROWTH, STRATEGIES, HalfBuffer
 from sampling.variance import pooled_covariance
 from torch_vdm import VDM, Haar
-from torch_vdm.quadtree import push
+from torch_vdm.model.quadtree import push
 
 Plane = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ StopReason = Literal["tolerance", "noise_threshold", "max_spp"]
 StrategyName = Literal["perceptual", "objective", "uniform", "halfbuffer"]
 
 # What `state` is made of. Raised when an older state would be continued differently.
-STATE_VERSION = 6
+STATE_VERSION = 7
 
 # Share of the tolerance that a round aims at, for a prediction is not exact. Status: choice.
 AIM = 0.98

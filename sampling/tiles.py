@@ -15,8 +15,8 @@ from torch.nn import functional
 
 from sampling.boundary import QUARTILE, boundaries, detail_variances
 from torch_vdm import VDM
-from torch_vdm.cortex import Cortex
-from torch_vdm.grid import Before
+from torch_vdm.model.cortex import Cortex
+from torch_vdm.model.grid import Before
 
 # Levels of no more nodes are computed whole: there an operation costs more than its numbers.
 # Status: choice, as in `torch_vdm.vdm`.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from benchmarks import places
 from tests.reference import calibrated
 from torch_vdm import Haar, Observer
-from torch_vdm.cortex import Transform
+from torch_vdm.model.cortex import Transform
 
 settings.register_profile("default", deadline=None, derandomize=True, max_examples=40)
 settings.load_profile("default")

@@ -5,7 +5,7 @@ import torch
 
 from tests.reference import paper
 from torch_vdm import Observer
-from torch_vdm.aberration import attenuation
+from torch_vdm.model.aberration import attenuation
 
 
 def short_wave(frequency: float, observer: Observer) -> float:

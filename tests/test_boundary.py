@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sampling.boundary import QUARTILE, boundaries, detail_variances
 from torch_vdm import Haar
-from torch_vdm.cortex import Cortex
+from torch_vdm.model.cortex import Cortex
 
 SIZES = [(1, 2), (2, 2), (8, 8), (5, 7), (3, 1), (6, 11), (9, 12)]
 

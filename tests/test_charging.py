@@ -15,10 +15,11 @@ from torch import Tensor
 from tests.conftest import make_xyz, reference_numbers
 from tests.ladder import TRANSFORMS
 from tests.reference import calibrated
-from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, VDMLoss, vdm
-from torch_vdm.charging import charge
-from torch_vdm.cortex import Transform, bands
-from torch_vdm.quadtree import apart, stacked
+from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, VDMLoss
+from torch_vdm.model.charging import charge
+from torch_vdm.model.cortex import Transform, bands
+from torch_vdm.model.quadtree import apart, stacked
+from torch_vdm.run import schedule
 
 PPD = 60.0
 UNCHARGED = dataclasses.replace(Observer.calibrated(), charging=False)
@@ -120,8 +121,8 @@ CHANGES = [
 
 @each
 def test_nor_in_strips(transform: Transform, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vdm, "STRIP", 1024)
-    monkeypatch.setattr(vdm, "BAND_STRIP", 512)
+    monkeypatch.setattr(schedule, "STRIP", 1024)
+    monkeypatch.setattr(schedule, "BAND_STRIP", 512)
     monkeypatch.setattr(bands, "LARGEST_AT_ONCE", 500)
     for change in CHANGES:
         with torch.no_grad():

@@ -17,8 +17,8 @@ from tests.test_colour import chunk, with_chunks
 from tests.test_io import ACES, hand_made_exr, png16, rgb, write_exr
 from torch_vdm import VDM, Display, Haar, StationaryHaar, Steerable, __version__
 from torch_vdm.cli import main
-from torch_vdm.cortex import Transform
 from torch_vdm.io import ImageError, load, read_image, write_channels, write_image
+from torch_vdm.model.cortex import Transform
 
 Pair = tuple[str, str]
 

@@ -5,7 +5,7 @@ import torch
 
 from tests.conftest import make_xyz
 from tests.reference import paper
-from torch_vdm.cones import XYZ_TO_SML, cone_responses
+from torch_vdm.model.cones import XYZ_TO_SML, cone_responses
 
 MATRIX = torch.tensor(XYZ_TO_SML, dtype=torch.float64)
 

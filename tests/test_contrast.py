@@ -6,15 +6,15 @@ import torch
 
 from tests.conftest import KINDS, make_xyz
 from tests.reference import calibrated, paper
-from torch_vdm.contrast import (
+from torch_vdm.model.contrast import (
     SML_TO_OPPONENTS,
     adapted,
     local_contrast,
     opponents,
     weber_contrast,
 )
-from torch_vdm.cortex import Haar
-from torch_vdm.quadtree import push
+from torch_vdm.model.cortex import Haar
+from torch_vdm.model.quadtree import push
 
 DARK_LIGHT = 0.3
 DARK_CONES = torch.from_numpy(paper.cone_dark_light(DARK_LIGHT))

@@ -9,8 +9,8 @@ import torch
 
 from tests.conftest import KINDS, make_xyz
 from tests.reference import calibrated, paper
-from torch_vdm.cortex import Haar
-from torch_vdm.grid import PAPERS
+from torch_vdm.model.cortex import Haar
+from torch_vdm.model.grid import PAPERS
 
 
 @pytest.mark.parametrize("true_means", [False, True])

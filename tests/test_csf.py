@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.reference import calibrated, paper
-from torch_vdm.csf import bandpass, barten, butterworth
+from torch_vdm.model.csf import bandpass, barten, butterworth
 
 
 def tensors(*numbers: float) -> list[torch.Tensor]:

@@ -5,7 +5,7 @@ import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from torch_vdm import VDM, Haar, Observer, StationaryHaar, Steerable, VDMLoss
-from torch_vdm.cortex import Transform
+from torch_vdm.model.cortex import Transform
 
 each_transform = pytest.mark.parametrize(
     "transform", [Haar(), StationaryHaar(), Steerable()], ids=lambda t: type(t).__name__

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torch_vdm import Display, pixels_per_degree
-from torch_vdm.display import BRIGHTEST, BT709_TO_XYZ, decode_srgb, encode_srgb
+from torch_vdm.model.display import BRIGHTEST, BT709_TO_XYZ, decode_srgb, encode_srgb
 
 PRIMARIES = torch.tensor(BT709_TO_XYZ, dtype=torch.float64)
 

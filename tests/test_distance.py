@@ -5,14 +5,14 @@ import pytest
 import torch
 
 from tests.reference import paper
-from torch_vdm.charging import Charge
-from torch_vdm.distance import (
+from torch_vdm.model.charging import Charge
+from torch_vdm.model.distance import (
     accumulate,
     just_noticeable,
     local_visual_difference,
     local_visual_difference_of_energy,
 )
-from torch_vdm.quadtree import push
+from torch_vdm.model.quadtree import push
 
 EXPONENT = torch.tensor(2.4, dtype=torch.float64)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sampling.error import maximum, total
 from torch_vdm import VDM, Display, Haar, Observer
-from torch_vdm.grid import Grid
+from torch_vdm.model.grid import Grid
 
 SIZES = [(1, 1), (1, 2), (4, 4), (5, 3), (8, 13)]
 Planes = list[NDArray[np.float64]]

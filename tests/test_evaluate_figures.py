@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torch_vdm import VDM, Display
-from torch_vdm.display import decode_srgb, encode_srgb
 from torch_vdm.evaluate import flicker, maps, peers, pictures
+from torch_vdm.model.display import decode_srgb, encode_srgb
 
 
 def unpacked(path: Path) -> tuple[str, NDArray[np.uint8]]:

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from torch_vdm.fast import KEPT, MOST_FORMS, for_any_size
+from torch_vdm.run.compiled import KEPT, MOST_FORMS, for_any_size
 
 
 def in_two_threads(settings: object) -> None:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar, Steerable, VDMLoss
-from torch_vdm.cortex import Transform
+from torch_vdm.model.cortex import Transform
 
 EFFECTS = [Effects(*switches) for switches in itertools.product((True, False), repeat=4)]
 DISPLAYS = [Display.srgb(), Display.linear(1e4, exposure=-3.0), Display.xyz()]

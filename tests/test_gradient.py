@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torch_vdm import VDM, Display, Effects, VDMLoss, vdm
+from torch_vdm import VDM, Display, Effects, VDMLoss
+from torch_vdm.run import schedule, whole
 
 # Images here are numbers that need be no pictures.
 pytestmark = pytest.mark.filterwarnings("ignore:expected sRGB-coded values:UserWarning")
@@ -13,8 +14,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:expected sRGB-coded values:UserW
 @pytest.fixture(autouse=True)
 def level_by_level(monkeypatch: pytest.MonkeyPatch) -> None:
     # As a large image is: small levels are autograd's.
-    monkeypatch.setattr(vdm, "FEW_NODES", 1)
-    monkeypatch.setattr(vdm, "LARGEST_AT_ONCE", 500)
+    monkeypatch.setattr(schedule, "FEW_NODES", 1)
+    monkeypatch.setattr(schedule, "LARGEST_AT_ONCE", 500)
 
 
 def gradients(
@@ -43,7 +44,7 @@ def test_is_autograds(
     size: tuple[int, int], wanted: tuple[bool, bool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ours = gradients(VDM(), noise(size), wanted)
-    monkeypatch.setattr(vdm, "by_hand", lambda: False)
+    monkeypatch.setattr(whole, "by_hand", lambda: False)
     for mine, theirs in zip(ours, gradients(VDM(), noise(size), wanted), strict=True):
         # Of the largest: a slope may be what two that are millions of times as large leave.
         largest = 0.0 if theirs is None else float(theirs.abs().max())
@@ -63,7 +64,7 @@ def test_is_autograds(
 def test_is_autograds_for_every_option(metric: VDM, monkeypatch: pytest.MonkeyPatch) -> None:
     # HDR, with values below 0.
     ours = gradients(metric, noise((12, 9), 30.0), (True, True))
-    monkeypatch.setattr(vdm, "by_hand", lambda: False)
+    monkeypatch.setattr(whole, "by_hand", lambda: False)
     for mine, theirs in zip(
         ours, gradients(metric, noise((12, 9), 30.0), (True, True)), strict=True
     ):

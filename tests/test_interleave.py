@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_vdm.interleave import interleaved
+from torch_vdm.model.interleave import interleaved
 
 
 @pytest.mark.parametrize("dim", [-1, -2])

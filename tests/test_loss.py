@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, VDMLoss
-from torch_vdm.cortex import Transform
-from torch_vdm.gradient import by_hand
 from torch_vdm.loss import DARK_LIGHT
+from torch_vdm.model.cortex import Transform
+from torch_vdm.run.backward import by_hand
 
 
 def images(batch: int = 3) -> tuple[Tensor, Tensor]:
@@ -156,8 +156,8 @@ def test_a_checkpoint_changes_no_gradient(
     transform: Transform, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # In parts and level by level, as a large image is.
-    monkeypatch.setattr("torch_vdm.vdm.LARGEST_AT_ONCE", 1000)
-    monkeypatch.setattr("torch_vdm.vdm.FEW_NODES", 16)
+    monkeypatch.setattr("torch_vdm.run.schedule.LARGEST_AT_ONCE", 1000)
+    monkeypatch.setattr("torch_vdm.run.schedule.FEW_NODES", 16)
     generator = torch.Generator().manual_seed(5)
     test, reference = torch.rand(2, 2, 3, 37, 50, dtype=torch.float64, generator=generator)
     test.requires_grad_()
@@ -171,7 +171,7 @@ def test_a_checkpoint_changes_no_gradient(
     for checkpoint in (False, True):
         loss = VDMLoss(transform=transform, checkpoint=checkpoint)
         # Against what autograd keeps: where the gradient is worked out by hand, that is less.
-        monkeypatch.setattr("torch_vdm.vdm.by_hand", by_hand if checkpoint else lambda: False)
+        monkeypatch.setattr("torch_vdm.run.whole.by_hand", by_hand if checkpoint else lambda: False)
         kept.append({})
         with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
             value = loss(test, reference)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tests.conftest import reference_numbers
 from tests.reference import calibrated, paper
-from torch_vdm.masking import energy_transducer, masking_energy, unmasked
+from torch_vdm.model.masking import energy_transducer, masking_energy, unmasked
 
 Q = torch.tensor(0.3, dtype=torch.float64)
 

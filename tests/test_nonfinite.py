@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from torch_vdm import VDM, Display, Haar, StationaryHaar, VDMLoss
-from torch_vdm.cortex import Transform
 from torch_vdm.images import finite_in_both
+from torch_vdm.model.cortex import Transform
 
 
 def images(size: int = 96) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ from torch._dynamo.backends.debugging import aot_eager
 from torch._dynamo.utils import counters
 
 from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, VDMLoss
-from torch_vdm.cortex import Transform
+from torch_vdm.model.cortex import Transform
 
 SIZES = ((2, 3, 24, 24), (2, 3, 40, 31), (5, 3, 17, 50), (1, 3, 9, 64))
 

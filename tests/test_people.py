@@ -8,7 +8,7 @@ import pytest
 from benchmarks.people import PPD, Zone, gabor, threshold_on, white_noise, zone_scores, zones
 from tests.ladder import TRANSFORMS
 from torch_vdm import VDM, Display, Haar, StationaryHaar, Steerable
-from torch_vdm.cortex import Transform
+from torch_vdm.model.cortex import Transform
 
 # The middle of every other zone, so many pixels a side.
 SIDE = 100

@@ -6,8 +6,8 @@ import torch
 from torch.nn import functional
 
 from tests.reference import paper
-from torch_vdm.pooling import pool, surround, within
-from torch_vdm.quadtree import stacked
+from torch_vdm.model.pooling import pool, surround, within
+from torch_vdm.model.quadtree import stacked
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 4), (2, 2), (5, 7)])

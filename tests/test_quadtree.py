@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from tests.reference import calibrated, paper
-from torch_vdm import quadtree
-from torch_vdm.grid import UNSHIFTED, Before, Grid, thirds
-from torch_vdm.quadtree import apart, pad_even, push, stacked
+from torch_vdm.model import quadtree
+from torch_vdm.model.grid import UNSHIFTED, Before, Grid, thirds
+from torch_vdm.model.quadtree import apart, pad_even, push, stacked
 
 SIZES = [(1, 1), (1, 2), (2, 1), (2, 2), (3, 5), (8, 8), (7, 12)]
 

@@ -16,7 +16,7 @@ from sampling.sampler import AIM, UNLIT
 from sampling.statistics import PIECE, Statistics
 from sampling.strategies import STRATEGIES
 from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar
-from torch_vdm.cortex import Transform
+from torch_vdm.model.cortex import Transform
 
 METRIC = VDM(60.0, Display.linear(100.0))
 SIZE = (12, 9)

@@ -5,8 +5,9 @@ import torch
 from torch import Tensor
 
 from tests.ladder import TRANSFORMS
-from torch_vdm import VDM, Observer, VDMLoss, vdm
-from torch_vdm.cortex import Transform, bands
+from torch_vdm import VDM, Observer, VDMLoss
+from torch_vdm.model.cortex import Transform, bands
+from torch_vdm.run import schedule
 
 OBSERVERS = [Observer.calibrated(), Observer.paper()]
 
@@ -16,13 +17,13 @@ SIZES = [(160, 64), (161, 83), (299, 20), (70, 131), (5, 700), (2100, 1), (1, 21
 
 @pytest.fixture(autouse=True)
 def thin_strips(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vdm, "STRIP", 1024)
-    monkeypatch.setattr(vdm, "BAND_STRIP", 512)
+    monkeypatch.setattr(schedule, "STRIP", 1024)
+    monkeypatch.setattr(schedule, "BAND_STRIP", 512)
     monkeypatch.setattr(bands, "LARGEST_AT_ONCE", 500)
 
 
 def whole_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    for place, name in ((vdm, "STRIP"), (vdm, "BAND_STRIP"), (bands, "LARGEST_AT_ONCE")):
+    for place, name in ((schedule, "STRIP"), (schedule, "BAND_STRIP"), (bands, "LARGEST_AT_ONCE")):
         monkeypatch.setattr(place, name, 2**40)
 
 

@@ -8,7 +8,7 @@ import torch
 
 from benchmarks.thresholds import Threshold, background, pattern, read_thresholds, render, sampling
 from torch_vdm import VDM, Display
-from torch_vdm.cones import XYZ_TO_SML
+from torch_vdm.model.cones import XYZ_TO_SML
 
 ROWS = read_thresholds()
 

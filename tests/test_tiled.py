@@ -10,8 +10,8 @@ from torch import Tensor
 
 from tests.ladder import TRANSFORMS
 from torch_vdm import VDM, Display, Effects, ImageError, Observer
-from torch_vdm.cortex import Transform
 from torch_vdm.io import ArrayFile
+from torch_vdm.model.cortex import Transform
 
 OBSERVERS = [Observer.calibrated(), Observer.paper()]
 NAMES = ("test", "reference")

@@ -25,7 +25,7 @@ from benchmarks.rooms import room
 from benchmarks.unet import UNet, crops, denoise, train
 from sampling.renderers.llvm import LLVMError
 from sampling.renderers.mitsuba import SceneError, load_mitsuba
-from torch_vdm.display import encode_srgb
+from torch_vdm.model.display import encode_srgb
 
 
 def pictures(side: int = 24) -> list[Picture]:

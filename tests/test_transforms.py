@@ -14,8 +14,9 @@ from tests.conftest import KINDS, make_xyz, reference_numbers
 from tests.ladder import FILTERED, TRANSFORMS
 from tests.reference import calibrated, transforms
 from tests.reference.paper import cone_fundamentals
-from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, VDMLoss, vdm
-from torch_vdm.cortex import Transform, bands
+from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, VDMLoss
+from torch_vdm.model.cortex import Transform, bands
+from torch_vdm.run import schedule
 
 PPD = 64.0
 OVERLAPPING: list[Transform] = [StationaryHaar(), Steerable(), StationaryHaar("filter")]
@@ -46,7 +47,7 @@ def test_levels_at_once_are_levels_one_by_one(
     metric = VDM(PPD, observer=observer, transform=transform)
     test, reference = (random_images(seed, 2, *size).double() for seed in (1, 2))
     at_once = metric(test, reference)
-    monkeypatch.setattr(vdm, "FEW_NODES", 0)
+    monkeypatch.setattr(schedule, "FEW_NODES", 0)
     torch.testing.assert_close(at_once, metric(test, reference), rtol=1e-12, atol=1e-12)
 
 
@@ -191,7 +192,7 @@ def test_a_filtered_grating_has_its_contrast_sensitivity(
     light = grating(cpd / PPD, 0.01, 0.4, size=256)
     to_cones = metric.get_buffer("cones") @ metric.get_buffer("primaries")
     planes = torch.einsum("ij,bjhw->bihw", to_cones, luminance * light)
-    seen = metric._weighted_contrast(planes)[0, 0, 96:160, 96:160]
+    seen = metric.model(planes.dtype).filtered(planes)[0, 0, 96:160, 96:160]
     amplitude = float(seen.square().mean().sqrt()) * math.sqrt(2.0)
     mean = 0.5 * luminance
     numbers = reference_numbers(Haar("filter"))
@@ -405,8 +406,8 @@ def test_large_planes_in_parts_are_the_same(
     metric = metric_of(transform)
     test, reference = random_images(1).double(), random_images(2).double()
     expected = metric(test, reference)
-    monkeypatch.setattr("torch_vdm.vdm.LARGEST_AT_ONCE", 100)
-    monkeypatch.setattr("torch_vdm.cortex.steerable.LARGEST_AT_ONCE", 100)
+    monkeypatch.setattr("torch_vdm.run.schedule.LARGEST_AT_ONCE", 100)
+    monkeypatch.setattr("torch_vdm.model.cortex.steerable.LARGEST_AT_ONCE", 100)
     torch.testing.assert_close(metric(test, reference), expected, rtol=1e-12, atol=1e-12)
 
 

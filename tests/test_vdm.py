@@ -24,11 +24,11 @@ from torch_vdm import (
     Haar,
     Observer,
     VDMLoss,
-    vdm,
 )
-from torch_vdm.cortex import Transform
 from torch_vdm.functional import visual_difference
-from torch_vdm.quadtree import apart, stacked
+from torch_vdm.model.cortex import Transform
+from torch_vdm.model.quadtree import apart, stacked
+from torch_vdm.run import schedule
 
 PPD = 48.0
 EFFECTS = [Effects(*switches) for switches in itertools.product((True, False), repeat=4)]
@@ -151,18 +151,19 @@ def test_fast_route_answers_the_same() -> None:
     assert torch.equal(pickle.loads(pickle.dumps(fast))(*pair), fast(*pair))
 
 
-@pytest.mark.parametrize("few", [0, 40, vdm.FEW_NODES])
+@pytest.mark.parametrize("few", [0, 40, schedule.FEW_NODES])
 @pytest.mark.parametrize("effects", [Effects(), Effects(pooling=False), Effects(chromatic=False)])
 @pytest.mark.parametrize("size", [(1, 1), (1, 6), (16, 16), (21, 34), (33, 12)])
 def test_items_below_one_another_are_seen_each_by_itself(
     size: tuple[int, int], effects: Effects, few: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(vdm, "FEW_NODES", few)
+    monkeypatch.setattr(schedule, "FEW_NODES", few)
     metric = VDM(effects=effects)
     batch = [image.double().requires_grad_() for image in images(3, *size)]
     expected = metric.compare(*(metric.represent(image) for image in batch))
+    model = metric.model(torch.float64)
     below = (
-        Haar().decompose(metric._cone_planes(stacked(image)), true_means=True, items=3)
+        Haar().decompose(model.cone_planes(stacked(image)), true_means=True, items=3)
         for image in batch
     )
     actual = apart(metric.compare(*below)[0], 3).transpose(0, 1)
@@ -223,8 +224,8 @@ def test_large_images_compile_nothing_twice(monkeypatch: pytest.MonkeyPatch) -> 
     # and that are not.
     from torch._dynamo.utils import counters
 
-    monkeypatch.setattr(vdm, "FEW_NODES", 300)
-    monkeypatch.setattr(vdm, "STRIP", 2048)
+    monkeypatch.setattr(schedule, "FEW_NODES", 300)
+    monkeypatch.setattr(schedule, "STRIP", 2048)
     fast = VDM().compile()
     with torch.no_grad():
         fast(*images(1, 64, 64))
@@ -318,12 +319,12 @@ def test_effects_that_are_off_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> N
         pytest.fail("an effect that is off was computed")
 
     for name in (
-        "vdm.attenuation",
-        "vdm.butterworth",
-        "vdm.surround",
-        "vdm.unmasked",
-        "response.masking_energy",
-        "gradient.surround",
+        "model.model.attenuation",
+        "model.model.butterworth",
+        "model.level.surround",
+        "model.level.unmasked",
+        "model.level.masking_energy",
+        "run.backward.surround",
     ):
         monkeypatch.setattr(f"torch_vdm.{name}", forbidden)
     VDM(effects=Effects(False, False, False, False))(*images())

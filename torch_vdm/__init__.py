@@ -4,11 +4,11 @@ from importlib import import_module
 from typing import Any
 
 from torch_vdm import functional
-from torch_vdm.cortex import Haar, StationaryHaar, Steerable
-from torch_vdm.display import Display, pixels_per_degree
 from torch_vdm.effects import Effects
 from torch_vdm.io import ImageError, read_image, write_image
 from torch_vdm.loss import VDMLoss
+from torch_vdm.model.cortex import Haar, StationaryHaar, Steerable
+from torch_vdm.model.display import Display, pixels_per_degree
 from torch_vdm.observer import Observer
 from torch_vdm.vdm import VDM
 

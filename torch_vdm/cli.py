@@ -21,8 +21,6 @@ import torch
 from torch import Tensor
 
 from torch_vdm import __version__
-from torch_vdm.cortex import Haar, StationaryHaar, Steerable, Transform
-from torch_vdm.display import Display, pixels_per_degree
 from torch_vdm.evaluate import command as evaluation
 from torch_vdm.evaluate.frames import EvaluationError
 from torch_vdm.evaluate.judge import Bench
@@ -30,9 +28,11 @@ from torch_vdm.io import ImageError, atomic_path, check_target, write_image
 from torch_vdm.io.alpha import colour
 from torch_vdm.io.refusal import printable
 from torch_vdm.loading import Pair, displays_of, load_pairs
+from torch_vdm.model.cortex import Haar, StationaryHaar, Steerable, Transform
+from torch_vdm.model.display import Display, pixels_per_degree
 from torch_vdm.observer import Observer
 from torch_vdm.report import Comparison, figures, plain_console, table, write_heat_map
-from torch_vdm.tiling import SMALLEST_TILE, TILE, whole
+from torch_vdm.run.tiling import SMALLEST_TILE, TILE, whole
 from torch_vdm.vdm import VDM
 
 DONE, EXCEEDED, BAD_INPUT, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import is_fake
 from torch.nn import functional
 
-from torch_vdm.quadtree import push
+from torch_vdm.model.quadtree import push
 
 # A picture that has a higher sRGB code than this, or a larger share of values below the lowest, is
 # taken for none: filters and noise leave less. Status: choice.

@@ -10,12 +10,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_vdm.display import BT709_TO_XYZ, Display, decode_srgb, encode_srgb
 from torch_vdm.io import ArrayFile, Image, ImageError, load
 from torch_vdm.io.arrays import MAGIC
 from torch_vdm.io.exr_header import listed
+from torch_vdm.model.display import BT709_TO_XYZ, Display, decode_srgb, encode_srgb
 from torch_vdm.report import BAND, shrunk
-from torch_vdm.tiling import Source, read
+from torch_vdm.run.tiling import Source, read
 
 
 @dataclass(frozen=True)

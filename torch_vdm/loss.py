@@ -7,12 +7,13 @@ from typing import Any, Literal, Self, get_args
 import torch
 from torch import Tensor
 
-from torch_vdm import operators
-from torch_vdm.cortex import Haar
-from torch_vdm.display import Display
-from torch_vdm.distance import just_noticeable
+from torch_vdm.model.cortex import Haar
+from torch_vdm.model.display import Display
+from torch_vdm.model.distance import just_noticeable
 from torch_vdm.observer import Observer
 from torch_vdm.options import choice, number, switch
+from torch_vdm.run import operators
+from torch_vdm.run.schedule import chosen
 from torch_vdm.vdm import VDM
 
 Reduction = Literal["mean", "sum", "none"]
@@ -114,7 +115,7 @@ class VDMLoss(operators.Enrolled):
         """Return the loss of every item, (B,); arguments as `forward`."""
         test, reference, seen = self.metric._checked(test, reference)
         # The L1 term first: what it needs on the way is gone when the metric needs most.
-        l1 = self.l1 * self.metric._in_rows(self._absolute, test, reference) if self.l1 else 0.0
+        l1 = self.l1 * self._in_rows(test, reference) if self.l1 else 0.0
         power = self.metric._power(test, reference, seen)
         exponent = self.metric.observer.summation_exponent / EXPONENT
         plane = torch.log1p(just_noticeable(power, power.new_tensor(exponent))) + l1
@@ -124,6 +125,11 @@ class VDMLoss(operators.Enrolled):
         """Switch the metric to its fast route, `VDM.compile`."""
         self.metric.compile(*args, **kwargs)
         return self
+
+    def _in_rows(self, test: Tensor, reference: Tensor) -> Tensor:
+        """Return `_absolute`, a few rows at a time on every route."""
+        schedule = chosen(self.metric._job(test, reference)._replace(compiles=False))
+        return schedule.pixels(self._absolute, test, reference)
 
     def _absolute(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the mean absolute difference of sRGB-coded values, (B, 1, H, W)."""

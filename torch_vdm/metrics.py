@@ -10,8 +10,8 @@ from zlib import crc32
 import torch
 from torch import Tensor
 
-from torch_vdm.display import Display
-from torch_vdm.distance import VISIBLE
+from torch_vdm.model.display import Display
+from torch_vdm.model.distance import VISIBLE
 from torch_vdm.pair import PairMetric
 from torch_vdm.precision import widest
 from torch_vdm.vdm import VDM

@@ -277,8 +277,8 @@ class Observer:
     def fitted_to(self, transform: object) -> Self:
         """Return the observer with the numbers that were fitted with a transform.
 
-        ``transform`` is one of `torch_vdm.cortex`. Numbers that are not those of `calibrated` stay
-        as they are, and so does an observer of another name.
+        ``transform`` is one of `torch_vdm.model.cortex`. Numbers that are not those of `calibrated`
+        stay as they are, and so does an observer of another name.
         """
         kind = type(transform).__name__, str(getattr(transform, "csf", ""))
         if self.name != "calibrated" or kind not in FITTED:

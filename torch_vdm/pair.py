@@ -1,20 +1,14 @@
 """What every metric of two images shares: its options, its checks, its precision."""
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import fields
 from typing import Any, Literal, Self, get_args
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
-from torch_vdm import operators
-from torch_vdm.display import Display
-from torch_vdm.distance import just_noticeable
-from torch_vdm.fast import for_any_size
-from torch_vdm.grid import Grid
 from torch_vdm.images import (
     HIGHEST_CODE,
     MOST_BELOW,
@@ -28,10 +22,16 @@ from torch_vdm.images import (
     remedy,
     require_finite,
 )
-from torch_vdm.memory import keep_freed_memory
+from torch_vdm.model.display import Display
+from torch_vdm.model.distance import just_noticeable
+from torch_vdm.model.grid import Grid
 from torch_vdm.observer import Observer
 from torch_vdm.options import choice, number
 from torch_vdm.precision import computed_in, look_at, widest
+from torch_vdm.run import operators
+from torch_vdm.run.compiled import for_any_size
+from torch_vdm.run.memory import keep_freed_memory
+from torch_vdm.run.schedule import Job, at_once, chosen
 
 Nonfinite = Literal["raise", "mask"]
 
@@ -83,31 +83,33 @@ class PairMetric(operators.Enrolled):
         choice("nonfinite", nonfinite, get_args(Nonfinite))
         self.display = display or Display.srgb()
         self.nonfinite = nonfinite
-        self._fast = False
+        self._compiles = False
         self._checkpointed = False
         self._range_is_known = False
         # In which of both images values out of range are told: any, or all.
         self._out_of_range_in: Callable[[Iterable[bool]], bool] = any
         keep_freed_memory()
 
-    def _kept(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a part of the forward pass, of which a checkpoint keeps the arguments alone.
-
-        What was computed on the way is then computed again in the backward pass. Compiled graphs
-        choose by themselves what they keep.
-        """
-        if not self._checkpointed or torch.compiler.is_compiling() or not torch.is_grad_enabled():
-            return function(*arguments)
-        return checkpoint(function, *arguments, use_reentrant=False, preserve_rng_state=False)
-
     def _accumulated(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the accumulated differences of two checked batches, (B, 1, h, w)."""
         raise NotImplementedError
 
-    def _at_once(self, size: tuple[int, int]) -> int:
-        """Return how many items of a size `_accumulated` takes at once on the fast route."""
-        del size
-        return 1
+    @property
+    def _stackable(self) -> bool:
+        """Whether `_accumulated` takes items below one another; see `Job`."""
+        return False
+
+    def _job(self, test: Tensor, reference: Tensor) -> Job:
+        """Return what decides how two batches are compared."""
+        return Job(
+            len(test),
+            (test.shape[-2], test.shape[-1]),
+            self._stackable,
+            torch.is_grad_enabled() and (test.requires_grad or reference.requires_grad),
+            self._compiles,
+            self._checkpointed,
+            torch.compiler.is_compiling(),
+        )
 
     def _to_pixels(self, plane: Tensor, size: tuple[int, int], grid: Grid | None = None) -> Tensor:
         """Return a plane of `_accumulated`, or of its root, at the pixels of the images.
@@ -180,7 +182,7 @@ class PairMetric(operators.Enrolled):
         """
         if args or kwargs:
             raise ValueError("expected no arguments: the fast route has no options")
-        self._fast = True
+        self._compiles = True
         return self
 
     def forward(self, test: Tensor, reference: Tensor) -> Tensor:
@@ -248,25 +250,15 @@ class PairMetric(operators.Enrolled):
         return found
 
     def _total(self, test: Tensor, reference: Tensor) -> Tensor:
-        fast = self._fast and not torch.compiler.is_compiling()
-        with for_any_size() if fast else nullcontext():
-            at_once = self._at_once((test.shape[-2], test.shape[-1]))
-            parts = self._parts(test, reference, at_once)
-            totals = [self._accumulated(one, other) for one, other in parts]
+        job = self._job(test, reference)
+        items = at_once(job)
+        with for_any_size() if chosen(job).compiled else nullcontext():
+            if items >= len(test):
+                return self._accumulated(test, reference)
+            parts = zip(test.split(items), reference.split(items), strict=True)
+            # Copies, for compiled code is specialised on the offset of a view.
+            totals = [self._accumulated(one.clone(), other.clone()) for one, other in parts]
         return torch.cat(totals)
-
-    def _parts(
-        self, test: Tensor, reference: Tensor, at_once: int = 1
-    ) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield both batches, whole or, on the fast route, ``at_once`` items at a time."""
-        if not self._fast or len(test) == 1:
-            return iter([(test, reference)])
-        parts = zip(test.split(at_once), reference.split(at_once), strict=True)
-        # Compiled code gets one item as it is, and is specialised on the offset of a view; several
-        # are put below one another, which copies them.
-        return (
-            (one, other) if len(one) > 1 else (one.clone(), other.clone()) for one, other in parts
-        )
 
     def _require_image(self, name: str, image: Tensor) -> None:
         """Raise where ``image`` is not such as the metric takes, and say what makes it so."""

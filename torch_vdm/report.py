@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.distance import VISIBLE
 from torch_vdm.io import atomic_path
-from torch_vdm.tiling import Source, read
+from torch_vdm.model.distance import VISIBLE
+from torch_vdm.run.tiling import Source, read
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType

@@ -13,16 +13,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.cortex import oriented
-from torch_vdm.cortex.gaussian import along, expand, lowpass_response, reduce, response
-from torch_vdm.csf import barten
-from torch_vdm.display import BT709_TO_XYZ, Display
-from torch_vdm.distance import local_visual_difference
-from torch_vdm.fast import SMALLEST, step
-from torch_vdm.grid import Grid
-from torch_vdm.masking import energy_transducer
+from torch_vdm.model.cortex import oriented
+from torch_vdm.model.cortex.gaussian import along, expand, lowpass_response, reduce, response
+from torch_vdm.model.csf import barten
+from torch_vdm.model.display import BT709_TO_XYZ, Display
+from torch_vdm.model.distance import local_visual_difference
+from torch_vdm.model.grid import Grid
+from torch_vdm.model.masking import energy_transducer
 from torch_vdm.options import switch
 from torch_vdm.pair import Nonfinite, PairMetric
+from torch_vdm.run.schedule import Schedule
 
 # Line spread of the eye, the sum of weight exp(-decay x^2) and weight exp(-decay abs(x)), x in
 # minutes of arc. Source: Westheimer 1986. Status: source. Beyond RADIUS it is under 1/1000 of its
@@ -146,6 +146,10 @@ class Sarnoff(PairMetric):
             weights.append(float(sensitivity) / passed)
         return weights
 
+    @property
+    def _steps(self) -> Schedule:
+        return Schedule(compiled=self._compiles and not torch.compiler.is_compiling())
+
     def _accumulated(self, test: Tensor, reference: Tensor) -> Tensor:
         sensitivities = self._constants(test.dtype, "sensitivities")["sensitivities"]
         first, second = self._pyramid(test), self._pyramid(reference)
@@ -156,7 +160,7 @@ class Sarnoff(PairMetric):
             local = self._local_difference(contrasts[0], contrasts[1], sensitivity)
             if total is not None:
                 size = (local.shape[-2], local.shape[-1])
-                local = local + expand(total, size, self._fast)
+                local = local + expand(total, size, self._steps)
             total = local
         assert total is not None
         return total
@@ -164,43 +168,41 @@ class Sarnoff(PairMetric):
     def _local_difference(self, first: Tensor, second: Tensor, sensitivity: Tensor) -> Tensor:
         """Return the local visual difference (B, 1, h, w) of two contrast planes of a band."""
         exponent = self._constants(first.dtype, "summation_exponent")["summation_exponent"]
-        filtered = step(oriented.across, first, self._fast)
-        difference = step(_response_difference, first, self._fast)
-        gather = step(_pooled_difference, first, self._fast)
+        steps = self._steps
         halo = oriented.REACH
         padded = [_surround(plane, halo) for plane in (first, second)]
         height = first.shape[-2]
-        fast = self._fast and first.numel() >= SMALLEST
-        rows = height if fast else max(1, LARGEST_AT_ONCE * height // first.numel())
+        rows = steps.rows(height, first.numel(), LARGEST_AT_ONCE)
         parts = []
         for top in range(0, height, rows):
             end = min(top + rows, height) + 2 * halo
-            one, other = (filtered(plane[..., top:end, :]) for plane in padded)
-            parts.append(difference(one, other, sensitivity))
-        local: Tensor = gather(torch.cat(parts, -2) if len(parts) > 1 else parts[0], exponent)
+            one, other = (steps(oriented.across, plane[..., top:end, :]) for plane in padded)
+            parts.append(steps(_response_difference, one, other, sensitivity))
+        whole = torch.cat(parts, -2) if len(parts) > 1 else parts[0]
+        local: Tensor = steps(_pooled_difference, whole, exponent)
         return local
 
     def _contrast(self, plane: Tensor, lower: Tensor, lowest: Tensor) -> Tensor:
         """Return the local contrast: a Laplacian band over the lowpass two levels down."""
         size = (plane.shape[-2], plane.shape[-1])
-        around = expand(lowest, (lower.shape[-2], lower.shape[-1]), self._fast)
-        around = expand(around, size, self._fast)
-        lowpass = expand(lower, size, self._fast)
-        contrast: Tensor = step(_divided, plane, self._fast)(plane, lowpass, around)
+        around = expand(lowest, (lower.shape[-2], lower.shape[-1]), self._steps)
+        around = expand(around, size, self._steps)
+        lowpass = expand(lower, size, self._steps)
+        contrast: Tensor = self._steps(_divided, plane, lowpass, around)
         return contrast
 
     def _pyramid(self, image: Tensor) -> list[Tensor]:
         """Return the lowpass planes of the luminance after the optics, the finest first."""
         matrix = self._constants(image.dtype, "luminance")["luminance"]
-        plane = step(_luminance, image, self._fast)(image, self.display, matrix)
+        plane = self._steps(_luminance, image, self.display, matrix)
         for blur in (_blurred_along_rows, _blurred_along_columns):
-            plane = step(blur, plane, self._fast)(plane, self._spread)
+            plane = self._steps(blur, plane, self._spread)
         if self.resample:
             size = [max(1, round(side * MOSAIC / self.ppd)) for side in plane.shape[-2:]]
             plane = functional.interpolate(plane, size, mode="bicubic", antialias=True)
         planes = [plane]
         for _ in range(OCTAVES + 1):
-            planes.append(reduce(planes[-1], self._fast))
+            planes.append(reduce(planes[-1], self._steps))
         return planes
 
     def _to_pixels(

@@ -13,15 +13,15 @@ import torch
 from torch import Tensor
 
 from torch_vdm import __version__
-from torch_vdm.display import BT709_TO_XYZ, Display, decode_srgb, encode_srgb
 from torch_vdm.evaluate import flicker, maps, peers, pictures
 from torch_vdm.evaluate.frames import Job
 from torch_vdm.evaluate.journal import Result
 from torch_vdm.io import write_image
 from torch_vdm.io.refusal import printable
 from torch_vdm.loading import Pair
+from torch_vdm.model.display import BT709_TO_XYZ, Display, decode_srgb, encode_srgb
 from torch_vdm.report import figures
-from torch_vdm.tiling import TILE, Source, whole
+from torch_vdm.run.tiling import TILE, Source, whole
 from torch_vdm.vdm import VDM
 
 # Where maps, and pictures for the page, lie in the output folder.

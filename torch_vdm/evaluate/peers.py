@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from torch_vdm.display import encode_srgb
+from torch_vdm.model.display import encode_srgb
 
 # The side of SSIM's window, in pixels. Source: Wang et al. 2004. Status: source.
 SSIM_WINDOW = 11

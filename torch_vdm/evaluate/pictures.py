@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.display import encode_srgb
 from torch_vdm.io import atomic_path
+from torch_vdm.model.display import encode_srgb
 from torch_vdm.report import SMALLEST_SCALE
 
 # A side of a picture that the page shows, in pixels; larger images are shown by blocks of pixels.

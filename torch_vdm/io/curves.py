@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torch_vdm import display
+from torch_vdm.model import display
 
 Values: TypeAlias = NDArray[Any]
 

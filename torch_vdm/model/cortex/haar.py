@@ -8,10 +8,10 @@ from functools import lru_cache, partial
 import torch
 from torch import Tensor
 
-from torch_vdm.cortex.transform import CSF, DEEPEST, Base, Cortex, checked_csf, mean_of
-from torch_vdm.fast import step
-from torch_vdm.grid import PAPERS, Grid, thirds
-from torch_vdm.quadtree import apart, complete, own, pad_even, together
+from torch_vdm.model.cortex.transform import CSF, DEEPEST, Base, Cortex, checked_csf, mean_of
+from torch_vdm.model.grid import PAPERS, Grid, thirds
+from torch_vdm.model.quadtree import apart, complete, own, pad_even, together
+from torch_vdm.model.steps import PLAIN, Steps
 
 # The exponent of the sum over coefficients by which a diagonal grating is made as strong as a
 # vertical one; that of the detection score. Status: choice.
@@ -55,13 +55,13 @@ class Haar:
     def decompose(
         self,
         planes: Tensor,
-        fast: bool = False,
+        steps: Steps = PLAIN,
         true_means: bool = False,
         items: int = 1,
         *,
         grid: Grid | None = None,
     ) -> Cortex:
-        """Decompose (B, C, H, W) by Eq. 2 down to one node, by compiled steps if ``fast``.
+        """Decompose (B, C, H, W) by Eq. 2 down to one node, step by step.
 
         ``true_means``: a node at the border counts for the pixels that it has. Else for as many
         as its siblings, as the repeated last row or column of an odd side makes it. ``items``: so
@@ -74,13 +74,13 @@ class Haar:
         """
         size = (planes.shape[-2] // items, planes.shape[-1])
         base = Base(planes, 0, size, mean_of(planes, items))
-        return self.coarser(base, fast, true_means, items=items, grid=grid)
+        return self.coarser(base, steps, true_means, items=items, grid=grid)
 
     def begin(
         self,
         planes: Tensor,
         count: int,
-        fast: bool = False,
+        steps: Steps = PLAIN,
         true_means: bool = False,
         *,
         grid: Grid | None = None,
@@ -88,18 +88,18 @@ class Haar:
         """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
         size = (planes.shape[-2], planes.shape[-1])
         base = Base(planes, 0, size, planes[..., :1, :1])
-        cortex = self.coarser(base, fast, true_means, count, grid=grid)
+        cortex = self.coarser(base, steps, true_means, count, grid=grid)
         return cortex, cortex.lowpass[1]
 
-    def rest(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
+    def rest(self, base: Base, steps: Steps = PLAIN, true_means: bool = False) -> Cortex:
         """Return the coarser levels; see `Transform.rest`."""
-        return self.coarser(base, fast, true_means)
+        return self.coarser(base, steps, true_means)
 
     def reduced(
         self,
         planes: Tensor,
         octaves: int,
-        fast: bool = False,
+        steps: Steps = PLAIN,
         true_means: bool = False,
         *,
         grid: Grid | None = None,
@@ -108,20 +108,20 @@ class Haar:
         size = (planes.shape[-2], planes.shape[-1])
         if grid is None:
             grid = self.grid(size, true_means)
-        return [planes, *levels(planes, 0, size, fast, true_means, grid, octaves)[1]][octaves]
+        return [planes, *levels(planes, 0, size, steps, true_means, grid, octaves)[1]][octaves]
 
-    def resume(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
+    def resume(self, base: Base, steps: Steps = PLAIN, true_means: bool = False) -> Cortex:
         """Decompose the rest of an image; see `Transform.resume`."""
         # The first step is a level that tiles have.
         grid = self.grid(base.size, true_means)
-        _, (plane,) = levels(base.plane, base.octaves, base.size, fast, true_means, grid, 1)
+        _, (plane,) = levels(base.plane, base.octaves, base.size, steps, true_means, grid, 1)
         rest = base._replace(plane=plane, octaves=base.octaves + 1)
-        return self.coarser(rest, fast, true_means)
+        return self.coarser(rest, steps, true_means)
 
     def coarser(
         self,
         base: Base,
-        fast: bool = False,
+        steps: Steps = PLAIN,
         true_means: bool = False,
         count: int = DEEPEST,
         items: int = 1,
@@ -134,7 +134,7 @@ class Haar:
         plane, octaves, size, mean = base
         if grid is None:
             grid = self.grid(size, true_means)
-        details, lowpass = levels(plane, octaves, size, fast, true_means, grid, count, items)
+        details, lowpass = levels(plane, octaves, size, steps, true_means, grid, count, items)
         coarsest_first = tuple(reversed(details)), tuple(reversed(lowpass or [plane]))
         return Cortex(*coarsest_first, mean, octaves, items, grid)
 
@@ -158,7 +158,7 @@ def levels(
     planes: Tensor,
     octaves: int,
     size: tuple[int, int],
-    fast: bool,
+    steps: Steps,
     true_means: bool,
     grid: Grid,
     count: int = DEEPEST,
@@ -171,7 +171,7 @@ def levels(
     """
 
     def analyse(even: Tensor) -> tuple[Tensor, ...]:
-        both: tuple[Tensor, ...] = step(_analyse, even, fast)(even)
+        both: tuple[Tensor, ...] = steps(_analyse, even)
         return both
 
     found = _descended(planes, octaves, size, true_means, grid, count, analyse, items)

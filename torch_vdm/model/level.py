@@ -1,18 +1,37 @@
-"""One level of an image from details to responses: Fig. 2 from the third box to the seventh."""
+"""One level of two images, from details to their local visual difference: Fig. 2 from box 3 on.
 
-from collections.abc import Sequence
+Chromatic aberration and adaptation, local contrast, opponents contrast space and contrast
+sensitivity are of one image; masking and spatial pooling of two, in the order of the observer:
+
+- the paper's takes the difference of two transducers' outputs, and pools it;
+- the calibrated one pools the squared difference of weighted contrasts, which keep their sign, and
+  what masks it, and masks what is pooled.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_vdm.contrast import adapted, local_contrast, opponents
-from torch_vdm.csf import bandpass
-from torch_vdm.grid import NONE, Before
-from torch_vdm.masking import energy_transducer, masking_energy
-from torch_vdm.matrix import mix
-from torch_vdm.pooling import phase_energy
-from torch_vdm.quadtree import push
+from torch_vdm.model.contrast import adapted, local_contrast, opponents
+from torch_vdm.model.csf import bandpass
+from torch_vdm.model.distance import local_visual_difference, local_visual_difference_of_energy
+from torch_vdm.model.grid import NONE, Before
+from torch_vdm.model.masking import energy_transducer, masking_energy, unmasked
+from torch_vdm.model.matrix import mix
+from torch_vdm.model.pooling import (
+    covering,
+    phase_energy,
+    pool,
+    pool_halves,
+    surround,
+    surround_halves,
+    within,
+)
+from torch_vdm.model.quadtree import push
+from torch_vdm.model.steps import PLAIN, Steps
 
 # The constants that the sensitivity in the local luminance depends on.
 OF_LUMINANCE = (
@@ -113,18 +132,86 @@ class Sight(NamedTuple):
 
 
 class Options(NamedTuple):
-    """What a level's responses and their difference depend on beside details and sights."""
+    """What the boxes of a level depend on beside details and sights."""
 
-    matrix: Tensor
-    """(channels, 3), of Eq. 3."""
     signed: bool
     """As `Observer.signed`."""
     masking: bool
     """As `Effects.masking`."""
-    energies: bool
-    """Whether squares are pooled."""
     phases: int
     """As `Transform.phases`."""
+    overlapping: bool
+    """Whether nodes overlap, `Transform.shifts` of them in the width of one."""
+    pooled: int
+    """How many nodes in a row are pooled: 3, or 1."""
+    matrix: Tensor
+    """(channels, 3), of Eq. 3."""
+    transducer_exponent: Tensor
+    summation_exponent: Tensor
+
+    @property
+    def energies(self) -> bool:
+        """Whether squares are pooled.
+
+        Neighbours with signs would cancel; and of overlapping nodes and of quadrature pairs the
+        energy hardly depends on the phase of a grating.
+        """
+        return self.signed or self.overlapping
+
+
+def local_difference(
+    details: Tensor,
+    others: Tensor,
+    sight: Sight,
+    other_sight: Sight,
+    options: Options,
+    steps: Steps = PLAIN,
+    items: int = 1,
+) -> Tensor:
+    """Return the local visual difference (B, 1, h, w) of a level of two images.
+
+    ``details`` and ``others`` are (B, 3, orientations, h, w); sights at the nodes themselves.
+    """
+    difference = steps(response_difference, details, others, sight, other_sight, options)
+    return gathered(difference, options, steps, items)
+
+
+def gathered(difference: Tensor, options: Options, steps: Steps = PLAIN, items: int = 1) -> Tensor:
+    """Return the local visual difference (B, 1, h, w) of `difference_of` two images."""
+    around = surrounded(difference, options, steps, items)
+    return within(steps(pooled_difference, around, options), difference.shape[-2], items)
+
+
+def surrounded(
+    difference: Tensor, options: Options, steps: Steps = PLAIN, items: int = 1
+) -> Tensor:
+    """Return `difference_of` two images with the neighbours that `pooled_difference` takes."""
+    if options.overlapping:
+        rows: Tensor = steps(
+            pool_halves, surround_halves(difference, options.pooled), options.pooled, -1
+        )
+        return rows
+    return surround(difference, items) if options.pooled > 1 else difference
+
+
+def pooled_difference(around: Tensor, options: Options) -> Tensor:
+    """Return the local visual difference of what `surrounded` gives.
+
+    Printed responses are pooled as a difference, for pooling is linear; others come as squares.
+    """
+    count = 1.0
+    if options.overlapping:
+        pooled, count = pool_halves(around, options.pooled, -2), covering(options.pooled)
+    else:
+        pooled = pool(around) if options.pooled > 1 else around
+    if not options.energies:
+        return local_visual_difference(pooled, options.summation_exponent)
+    # The sums of overlapping nodes are divided where it costs least.
+    left: Tensor | float = -math.log2(count)
+    if options.signed and options.masking:
+        left = unmasked(pooled[:, :, -1:] / count, options.transducer_exponent) + left
+        pooled = pooled[:, :, :-1]
+    return local_visual_difference_of_energy(pooled, options.summation_exponent, left)
 
 
 def response(details: Tensor, sight: Sight, options: Options) -> Tensor:
@@ -182,7 +269,7 @@ def response_difference_at(
 def sights_of(
     parents: Sequence[Tensor],
     level: Level,
-    constants: dict[str, Tensor],
+    constants: Mapping[str, Tensor],
     local: bool,
     chromatic: bool,
 ) -> list[Sight]:
@@ -200,14 +287,14 @@ def sights_of(
     return sights
 
 
-def adapted_luminance(lowpass: Tensor, constants: dict[str, Tensor]) -> Tensor:
+def adapted_luminance(lowpass: Tensor, constants: Mapping[str, Tensor]) -> Tensor:
     """Return the luminance (B, 1, h, w) that the eye is adapted to, cd/m2, its own light in it."""
     seen = mix(constants["luminance_of_cones"], lowpass).clamp_min(0.0)
     return seen + constants["dark_light"]
 
 
 def sensitivity_at(
-    parent: Tensor, level: Level, constants: dict[str, Tensor], chromatic: bool
+    parent: Tensor, level: Level, constants: Mapping[str, Tensor], chromatic: bool
 ) -> Tensor:
     """Return the contrast sensitivity in the local luminance, at the parents."""
     luminance = adapted_luminance(parent, constants).unsqueeze(2)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_vdm.grid import PAPERS, Grid
+from torch_vdm.model.grid import PAPERS, Grid
 
 # Pixels a side of a tile. Status: choice; 1024 takes half a gigabyte with `Haar`.
 TILE = 1024

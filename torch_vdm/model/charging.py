@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.quadtree import apart, together
+from torch_vdm.model.quadtree import apart, together
 
 # How many nodes to each side, in the width of one, count as those near by, and as those around:
 # the second is as far as pooling and the lowpass of a parent spread the difference of a parent's

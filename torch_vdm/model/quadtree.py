@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.grid import NONE, Before, Side
-from torch_vdm.interleave import interleaved
+from torch_vdm.model.grid import NONE, Before, Side
+from torch_vdm.model.interleave import interleaved
 
 # Planes with no more numbers are enlarged by torch's own operation, which is faster for them.
 # Status: choice, measured.

@@ -8,17 +8,17 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.cortex.haar import (
+from torch_vdm.model.cortex.haar import (
     EXPONENT,
     Haar,
     lowpasses,
     wavelet_response,
     window_response,
 )
-from torch_vdm.cortex.transform import CSF, Base, Cortex, checked_csf, mean_of
-from torch_vdm.fast import step
-from torch_vdm.grid import PAPERS, Grid, Side
-from torch_vdm.interleave import interleaved
+from torch_vdm.model.cortex.transform import CSF, Base, Cortex, checked_csf, mean_of
+from torch_vdm.model.grid import PAPERS, Grid, Side
+from torch_vdm.model.interleave import interleaved
+from torch_vdm.model.steps import PLAIN, Steps
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class StationaryHaar:
     def decompose(
         self,
         planes: Tensor,
-        fast: bool = False,
+        steps: Steps = PLAIN,
         true_means: bool = False,
         *,
         grid: Grid | None = None,  # noqa: ARG002  # as `grid`
@@ -83,13 +83,13 @@ class StationaryHaar:
         parts = [planes, planes, *means][: len(means)]
         if not parts:
             return Cortex((), (planes,), mean)
-        return self._cortex(parts, 0, size, mean, fast, true_means)
+        return self._cortex(parts, 0, size, mean, steps, true_means)
 
     def begin(
         self,
         planes: Tensor,
         count: int,
-        fast: bool = False,
+        steps: Steps = PLAIN,
         true_means: bool = False,
         *,
         grid: Grid | None = None,  # noqa: ARG002  # as `grid`
@@ -99,17 +99,17 @@ class StationaryHaar:
         means = lowpasses(planes, 0, size, true_means, count - 2)
         parts = [planes, planes, *means]
         none = planes[..., :1, :1]
-        return self._cortex(parts, 0, size, none, fast, true_means), means[-1]
+        return self._cortex(parts, 0, size, none, steps, true_means), means[-1]
 
-    def rest(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
+    def rest(self, base: Base, steps: Steps = PLAIN, true_means: bool = False) -> Cortex:
         """Return the coarser levels; see `Transform.rest`."""
-        return self.resume(base, fast, true_means)
+        return self.resume(base, steps, true_means)
 
     def reduced(
         self,
         planes: Tensor,
         octaves: int,
-        fast: bool = False,  # noqa: ARG002  # as in `decompose`
+        steps: Steps = PLAIN,  # noqa: ARG002  # as in `decompose`
         true_means: bool = False,
         *,
         grid: Grid | None = None,  # noqa: ARG002  # as `grid`
@@ -118,11 +118,11 @@ class StationaryHaar:
         size = (planes.shape[-2], planes.shape[-1])
         return [planes, *lowpasses(planes, 0, size, true_means, octaves)][octaves]
 
-    def resume(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
+    def resume(self, base: Base, steps: Steps = PLAIN, true_means: bool = False) -> Cortex:
         """Decompose the rest of an image; see `Transform.resume`."""
         means = lowpasses(base.plane, base.octaves, base.size, true_means)
         parts = [base.plane, *means][: len(means) - 1]
-        return self._cortex(parts, base.octaves + 1, base.size, base.mean, fast, true_means)
+        return self._cortex(parts, base.octaves + 1, base.size, base.mean, steps, true_means)
 
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
         """Return the best frequency, cycles/pixel, and its gain for d1, d2 and d3.
@@ -139,7 +139,7 @@ class StationaryHaar:
         finest: int,
         size: tuple[int, int],
         mean: Tensor,
-        fast: bool,
+        steps: Steps,
         true_means: bool,
     ) -> Cortex:
         """Return the levels from ``finest`` on, of the means that are the parts of their nodes."""
@@ -150,7 +150,7 @@ class StationaryHaar:
         for level, part in enumerate(parts, finest):
             faded = _faded(part, PAPERS.sides(size, max(level - 1, 0))) if true_means else part
             analyse = _halves if level == 0 else _quarters
-            detail, *lowest = step(analyse, part, fast)(faded, means)
+            detail, *lowest = steps(analyse, faded, means)
             details.append(detail)
             lowpass += lowest
         return Cortex(tuple(reversed(details)), tuple(reversed(lowpass)), mean, finest)

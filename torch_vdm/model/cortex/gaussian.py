@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.fast import step
-from torch_vdm.interleave import interleaved
+from torch_vdm.model.interleave import interleaved
+from torch_vdm.model.steps import PLAIN, Steps
 
 # Weights of the lowpass, of sum 1; a = 3/8. Status: source.
 CENTRE, NEXT, OUTER = 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0
@@ -58,24 +58,24 @@ def lowpass_response(frequency: float) -> float:
     return response((OUTER, NEXT, CENTRE, NEXT, OUTER), frequency)
 
 
-def blur(plane: Tensor, fast: bool = False) -> Tensor:
+def blur(plane: Tensor, steps: Steps = PLAIN) -> Tensor:
     """Return the lowpass of a plane at every one of its samples."""
-    rows: Tensor = step(_blurred_rows, plane, fast)(plane)
-    columns: Tensor = step(_blurred_columns, plane, fast)(rows)
+    rows: Tensor = steps(_blurred_rows, plane)
+    columns: Tensor = steps(_blurred_columns, rows)
     return columns
 
 
-def reduce(plane: Tensor, fast: bool = False) -> Tensor:
+def reduce(plane: Tensor, steps: Steps = PLAIN) -> Tensor:
     """Return the next coarser plane: every second sample, ceil(h / 2) x ceil(w / 2) of them."""
-    rows: Tensor = step(_reduced_rows, plane, fast)(plane)
-    columns: Tensor = step(_reduced_columns, plane, fast)(rows)
+    rows: Tensor = steps(_reduced_rows, plane)
+    columns: Tensor = steps(_reduced_columns, rows)
     return columns
 
 
-def expand(plane: Tensor, size: tuple[int, int], fast: bool = False) -> Tensor:
+def expand(plane: Tensor, size: tuple[int, int], steps: Steps = PLAIN) -> Tensor:
     """Return a plane at the ``size`` of the next finer one, smooth between its own samples."""
-    rows: Tensor = step(_expanded_rows, plane, fast)(plane, size[1])
-    columns: Tensor = step(_expanded_columns, plane, fast)(rows, size[0])
+    rows: Tensor = steps(_expanded_rows, plane, size[1])
+    columns: Tensor = steps(_expanded_columns, rows, size[0])
     return columns
 
 

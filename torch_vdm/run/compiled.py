@@ -1,4 +1,4 @@
-"""The fast route: functions of planes, compiled once for every size."""
+"""Functions of planes, compiled once for every size."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,7 +9,6 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 # Planes with fewer numbers stay uncompiled: a compiled call costs more than they do.
 # Status: choice.
@@ -133,8 +132,3 @@ def for_any_size() -> Iterator[None]:
             if change.calls == 0:
                 _changes.remove(change)
                 set_to(change.before)
-
-
-def step(function: Callable[..., Any], plane: Tensor, fast: bool) -> Callable[..., Any]:
-    """Return a step's compiled form where it pays."""
-    return compiled(function) if fast and plane.numel() >= SMALLEST else function

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.cortex import oriented
-from torch_vdm.cortex.gaussian import blur, lowpass_response
-from torch_vdm.cortex.transform import CSF, DEEPEST, Base, Cortex, mean_of
-from torch_vdm.fast import SMALLEST, step
-from torch_vdm.grid import PAPERS, Grid
-from torch_vdm.interleave import interleaved
+from torch_vdm.model.cortex import oriented
+from torch_vdm.model.cortex.gaussian import blur, lowpass_response
+from torch_vdm.model.cortex.transform import CSF, DEEPEST, Base, Cortex, mean_of
+from torch_vdm.model.grid import PAPERS, Grid
+from torch_vdm.model.interleave import interleaved
+from torch_vdm.model.steps import PLAIN, Steps
 
 # The image half-way between its pixels, which the finest level needs: a sinc of so many taps on
 # either side, under a Hann window. Status: choice.
@@ -49,9 +49,9 @@ class Steerable:
 
     A band is a plane of the Gaussian pyramid less its own lowpass, taken before any sample is
     dropped, so that it has no aliases of its own. It is filtered by the pairs of
-    `torch_vdm.cortex.oriented` on a grid of twice the density of its level, the finest between the
-    image's pixels, and every second place is kept: nodes at the places of `StationaryHaar`, 10.7
-    times the coefficients of `Haar`.
+    `torch_vdm.model.cortex.oriented` on a grid twice as dense as its level, the finest between
+    the image's pixels, and every second place is kept: nodes at the places of `StationaryHaar`,
+    10.7 times the coefficients of `Haar`.
 
     Even and odd responses are kept apart, with their signs: the two images are compared by the
     length of the difference of their pairs, which no phase changes.
@@ -76,12 +76,12 @@ class Steerable:
     def decompose(
         self,
         planes: Tensor,
-        fast: bool = False,
+        steps: Steps = PLAIN,
         true_means: bool = False,  # noqa: ARG002  # see below
         *,
         grid: Grid | None = None,  # noqa: ARG002  # as `grid`
     ) -> Cortex:
-        """Decompose (B, C, H, W) to the coarsest level, by compiled steps if ``fast``.
+        """Decompose (B, C, H, W) to the coarsest level, step by step.
 
         ``true_means`` changes nothing: no sample of this pyramid stands for repeated pixels.
 
@@ -94,13 +94,13 @@ class Steerable:
         """
         mean = mean_of(planes)
         band = _doubled(_doubled(planes, -1), -2)
-        return self._cortex(planes, band - blur(band, fast), 0, mean, fast)
+        return self._cortex(planes, band - blur(band, steps), 0, mean, steps)
 
     def begin(
         self,
         planes: Tensor,
         count: int,
-        fast: bool = False,
+        steps: Steps = PLAIN,
         true_means: bool = False,
         *,
         grid: Grid | None = None,  # noqa: ARG002  # as `grid`
@@ -108,37 +108,37 @@ class Steerable:
         """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
         band = _doubled(_doubled(planes, -1), -2)
         none = planes[..., :1, :1]
-        cortex = self._cortex(planes, band - blur(band, fast), 0, none, fast, count)
-        return cortex, self.reduced(planes, count - 2, fast, true_means)
+        cortex = self._cortex(planes, band - blur(band, steps), 0, none, steps, count)
+        return cortex, self.reduced(planes, count - 2, steps, true_means)
 
-    def rest(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
+    def rest(self, base: Base, steps: Steps = PLAIN, true_means: bool = False) -> Cortex:
         """Return the coarser levels; see `Transform.rest`."""
-        return self.resume(base, fast, true_means)
+        return self.resume(base, steps, true_means)
 
     def reduced(
         self,
         planes: Tensor,
         octaves: int,
-        fast: bool = False,
+        steps: Steps = PLAIN,
         true_means: bool = False,  # noqa: ARG002  # as in `decompose`
         *,
         grid: Grid | None = None,  # noqa: ARG002  # as `grid`
     ) -> Tensor:
         """Return the Gaussian pyramid's plane; arguments as `decompose`."""
         for _ in range(octaves):
-            planes = _dropped(blur(planes, fast))
+            planes = _dropped(blur(planes, steps))
         return planes
 
     def resume(
         self,
         base: Base,
-        fast: bool = False,
+        steps: Steps = PLAIN,
         true_means: bool = False,  # noqa: ARG002  # as in `decompose`
     ) -> Cortex:
         """Decompose the rest of an image; see `Transform.resume`."""
-        smooth = blur(base.plane, fast)
+        smooth = blur(base.plane, steps)
         band = base.plane - smooth
-        return self._cortex(_dropped(smooth), band, base.octaves + 1, base.mean, fast)
+        return self._cortex(_dropped(smooth), band, base.octaves + 1, base.mean, steps)
 
     def _cortex(
         self,
@@ -146,7 +146,7 @@ class Steerable:
         band: Tensor,
         finest: int,
         mean: Tensor,
-        fast: bool,
+        steps: Steps,
         count: int = DEEPEST,
     ) -> Cortex:
         """Return the levels from ``finest`` on, of its plane and the band that it is made of.
@@ -161,8 +161,8 @@ class Steerable:
             # The nodes lie between those of the next finer level: at the odd ones of the doubled
             # image, the even ones but the first of all others.
             peak = self._peaks[level]
-            details.append(_responses(band, size, 1 if level == 0 else 2, peak, fast))
-            smooth = blur(plane, fast)
+            details.append(_responses(band, size, 1 if level == 0 else 2, peak, steps))
+            smooth = blur(plane, steps)
             lowpass.append(_next(smooth))
             band, plane = plane - smooth, _dropped(smooth)
         return Cortex(tuple(reversed(details)), tuple(reversed(lowpass or [plane])), mean, finest)
@@ -195,7 +195,7 @@ def _next(plane: Tensor) -> Tensor:
     return padded[..., 1:, 1:].contiguous()
 
 
-def _responses(band: Tensor, size: tuple[int, int], first: int, peak: Peak, fast: bool) -> Tensor:
+def _responses(band: Tensor, size: tuple[int, int], first: int, peak: Peak, steps: Steps) -> Tensor:
     """Return the responses (B, C, 8, h, w) to a band at every second place from ``first``."""
     reach = oriented.REACH
     more = [
@@ -204,14 +204,12 @@ def _responses(band: Tensor, size: tuple[int, int], first: int, peak: Peak, fast
     ]
     padded = functional.pad(band, (reach, more[1], reach, more[0]), mode="replicate")
     padded = padded[..., first:, first:]
-    fast = fast and band.numel() >= SMALLEST
-    rows = size[0] if fast else max(1, LARGEST_AT_ONCE * size[0] // band.numel())
-    across = step(oriented.across, band, fast)
-    pairs = step(_paired, band, fast)
+    rows = steps.rows(size[0], band.numel(), LARGEST_AT_ONCE)
     parts = []
     for top in range(0, size[0], rows):
         end = 2 * min(top + rows, size[0]) - 1 + 2 * reach
-        parts.append(pairs(across(padded[..., 2 * top : end, :], 2), peak.even, peak.odd))
+        across = steps(oriented.across, padded[..., 2 * top : end, :], 2)
+        parts.append(steps(_paired, across, peak.even, peak.odd))
     return torch.cat(parts, -2) if len(parts) > 1 else parts[0]
 
 

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from torch_vdm.matrix import mix
+from torch_vdm.model.matrix import mix
 
 # Rows S, M, L; columns X, Y, Z. Unit: cone response per cd/m2. Source: Eq. 1 of Bolin and Meyer
 # 1999, after Meyer 1988. Status: printed. S depends on Z alone, so a light without Z (the

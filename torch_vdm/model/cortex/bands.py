@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.cortex.gaussian import along, response
-from torch_vdm.cortex.transform import DEEPEST
-from torch_vdm.fast import step
-from torch_vdm.interleave import interleaved
+from torch_vdm.model.cortex.gaussian import along, response
+from torch_vdm.model.cortex.transform import DEEPEST
+from torch_vdm.model.interleave import interleaved
+from torch_vdm.model.steps import PLAIN, Steps
 
 # Weights of the pyramid's lowpass, cos(pi f)^6: Burt and Adelson's five taps leave aliases that
 # move a threshold by 2 dB with the phase of a grating. Status: choice, measured.
@@ -72,38 +72,38 @@ def halo(count: int) -> int:
     return wrong
 
 
-def lowpass(image: Tensor, count: int, fast: bool = False) -> Tensor:
+def lowpass(image: Tensor, count: int, steps: Steps = PLAIN) -> Tensor:
     """Return what is left of (B, C, H, W) after its ``count`` finest scales."""
     here = image
     for scale in range(count):
-        here = reduced(_smooth(here, fast) if scale == 0 else here, fast)
+        here = reduced(_smooth(here, steps) if scale == 0 else here, steps)
     return here
 
 
-def parted(plane: Tensor, finest: bool, fast: bool = False) -> Scale:
-    """Part a scale's bands from (B, C, h, w), the image if ``finest``, by compiled steps."""
-    here = _smooth(plane, fast) if finest else plane
-    rest = reduced(here, fast)
-    around = expanded(rest, (here.shape[-2], here.shape[-1]), fast)
+def parted(plane: Tensor, finest: bool, steps: Steps = PLAIN) -> Scale:
+    """Part a scale's bands from (B, C, h, w), the image if ``finest``."""
+    here = _smooth(plane, steps) if finest else plane
+    rest = reduced(here, steps)
+    around = expanded(rest, (here.shape[-2], here.shape[-1]), steps)
     band = here - around
     return Scale((plane - here, band) if finest else (band,), around, rest)
 
 
-def _smooth(image: Tensor, fast: bool) -> Tensor:
+def _smooth(image: Tensor, steps: Steps) -> Tensor:
     """Return an image without its finest band."""
-    rows = step(_parted_rows, image, fast)(image)
-    smooth: Tensor = step(_parted_columns, image, fast)(rows)
+    rows = steps(_parted_rows, image)
+    smooth: Tensor = steps(_parted_columns, rows)
     return smooth
 
 
-def gathered(planes: Sequence[Tensor], fast: bool = False) -> Tensor:
+def gathered(planes: Sequence[Tensor], steps: Steps = PLAIN) -> Tensor:
     """Add up one plane (B, C, h, w) a scale, the finest first, to one of the finest size."""
     total = planes[-1]
     for plane in reversed(planes[:-1]):
-        if fast or plane.numel() <= LARGEST_AT_ONCE:
-            total = plane + expanded(total, (plane.shape[-2], plane.shape[-1]), fast)
+        rows = steps.rows(plane.shape[-2], plane.numel(), LARGEST_AT_ONCE)
+        if rows >= plane.shape[-2]:
+            total = plane + expanded(total, (plane.shape[-2], plane.shape[-1]), steps)
             continue
-        rows = max(1, LARGEST_AT_ONCE * plane.shape[-2] // plane.numel())
         parts = plane.split(rows, -2)
         columns = _expanded_columns(total, plane.shape[-2]).split(rows, -2)
         total = torch.cat(
@@ -116,17 +116,17 @@ def gathered(planes: Sequence[Tensor], fast: bool = False) -> Tensor:
     return total
 
 
-def reduced(plane: Tensor, fast: bool = False) -> Tensor:
+def reduced(plane: Tensor, steps: Steps = PLAIN) -> Tensor:
     """Return the next coarser plane: every second sample, ceil(h / 2) x ceil(w / 2) of them."""
-    rows = step(_reduced_rows, plane, fast)(plane)
-    columns: Tensor = step(_reduced_columns, plane, fast)(rows)
+    rows = steps(_reduced_rows, plane)
+    columns: Tensor = steps(_reduced_columns, rows)
     return columns
 
 
-def expanded(plane: Tensor, size: tuple[int, int], fast: bool = False) -> Tensor:
+def expanded(plane: Tensor, size: tuple[int, int], steps: Steps = PLAIN) -> Tensor:
     """Return a plane at the ``size`` of the next finer one, smooth between its own samples."""
-    columns = step(_expanded_columns, plane, fast)(plane, size[0])
-    rows: Tensor = step(_expanded_rows, plane, fast)(columns, size[1])
+    columns = steps(_expanded_columns, plane, size[0])
+    rows: Tensor = steps(_expanded_rows, columns, size[1])
     return rows
 
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_vdm.charging import Charge
-from torch_vdm.grid import NONE, Before
-from torch_vdm.quadtree import push
+from torch_vdm.model.charging import Charge
+from torch_vdm.model.grid import NONE, Before
+from torch_vdm.model.quadtree import push
 
 # A difference over this is visible, in JND: the unit's definition.
 VISIBLE = 1.0
@@ -67,7 +67,7 @@ class Paths(NamedTuple):
     local: tuple[Tensor, ...]
     """One (B, 1, h, w) a level, level 0 (the root) first: what `accumulate` takes."""
     changes: tuple[Tensor, ...]
-    """The same shapes: how far the means of nodes differ, `torch_vdm.charging.changes`; or none."""
+    """The same shapes: how far the means of nodes differ, `charging.changes`; or none."""
     root: Tensor
     """(B, 1, 1, 1), what every path begins with."""
 

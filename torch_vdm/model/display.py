@@ -8,7 +8,7 @@ from typing import Literal, Self, get_args
 import torch
 from torch import Tensor
 
-from torch_vdm.matrix import mix
+from torch_vdm.model.matrix import mix
 from torch_vdm.options import choice, number
 
 Encoding = Literal["srgb", "linear", "xyz"]

@@ -4,10 +4,11 @@ from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
 
 from torch import Tensor
 
-from torch_vdm.grid import PAPERS, Before, Grid
+from torch_vdm.model.grid import PAPERS, Before, Grid
+from torch_vdm.model.quadtree import apart, together
+from torch_vdm.model.steps import PLAIN, Steps
 from torch_vdm.options import choice
 from torch_vdm.precision import widest
-from torch_vdm.quadtree import apart, together
 
 # Levels that constants are made for: an image of 2^24 pixels a side.
 DEEPEST = 24
@@ -124,12 +125,12 @@ class Transform(Protocol):
     def decompose(
         self,
         planes: Tensor,
-        fast: bool = False,
+        steps: Steps = PLAIN,
         true_means: bool = False,
         *,
         grid: Grid | None = None,
     ) -> Cortex:
-        """Decompose (B, C, H, W) to the coarsest level, by compiled steps if ``fast``.
+        """Decompose (B, C, H, W) to the coarsest level, step by step.
 
         ``true_means``: no pixel counts for more than another, at the border of an odd side too.
         ``grid``: that of a part of an image, a `Grid.part`; by default that of an image of this
@@ -140,14 +141,14 @@ class Transform(Protocol):
         self,
         planes: Tensor,
         octaves: int,
-        fast: bool = False,
+        steps: Steps = PLAIN,
         true_means: bool = False,
         *,
         grid: Grid | None = None,
     ) -> Tensor:
         """Return (B, C, H, W) at 1 / 2^octaves of its sides, rounded up: what `resume` takes."""
 
-    def resume(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
+    def resume(self, base: Base, steps: Steps = PLAIN, true_means: bool = False) -> Cortex:
         """Return the levels of `decompose` without its ``base.octaves`` + 1 finest.
 
         From what `reduced` gives, so that an image larger than memory is decomposed in tiles.
@@ -157,7 +158,7 @@ class Transform(Protocol):
         self,
         planes: Tensor,
         count: int,
-        fast: bool = False,
+        steps: Steps = PLAIN,
         true_means: bool = False,
         *,
         grid: Grid | None = None,
@@ -168,7 +169,7 @@ class Transform(Protocol):
         strips; a strip's mean is none.
         """
 
-    def rest(self, base: Base, fast: bool = False, true_means: bool = False) -> Cortex:
+    def rest(self, base: Base, steps: Steps = PLAIN, true_means: bool = False) -> Cortex:
         """Return the levels of `decompose` without its ``count`` - 1 finest.
 
         The plane of ``base`` is put together from those that `begin` gives of all strips.

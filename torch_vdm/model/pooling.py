@@ -3,7 +3,7 @@
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.quadtree import apart, together
+from torch_vdm.model.quadtree import apart, together
 
 
 def surround(responses: Tensor, items: int = 1) -> Tensor:

@@ -12,15 +12,15 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from torch_vdm.contrast import LARGEST, local_contrast, opponents
-from torch_vdm.distance import SMALLEST_DIFFERENCE
-from torch_vdm.masking import masking_energy
-from torch_vdm.matrix import mix
-from torch_vdm.pooling import pool, surround
-from torch_vdm.response import Sight
+from torch_vdm.model.contrast import LARGEST, local_contrast, opponents
+from torch_vdm.model.distance import SMALLEST_DIFFERENCE
+from torch_vdm.model.level import Sight
+from torch_vdm.model.masking import masking_energy
+from torch_vdm.model.matrix import mix
+from torch_vdm.model.pooling import pool, surround
 
 
-def local_difference(
+def local_difference_by_hand(
     function: Callable[[Tensor, Tensor, Sight, Sight], Tensor],
     details: Tensor,
     others: Tensor,

@@ -9,7 +9,7 @@ import math
 
 from torch import Tensor
 
-from torch_vdm.cortex.gaussian import along, response
+from torch_vdm.model.cortex.gaussian import along, response
 
 # Taps, their distance, and the coefficients of x in the odd filters. Status: source.
 TAPS, SPACING = 9, 0.67

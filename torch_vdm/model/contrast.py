@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from torch_vdm.matrix import mix
+from torch_vdm.model.matrix import mix
 
 # Rows A, C1, C2; columns S, M, L. Unit: opponent contrast per cone contrast. Source: Eq. 3 of
 # Bolin and Meyer 1999, after Meyer 1988. Status: printed. It is not opponent on cone contrasts:

@@ -1,0 +1,314 @@
+"""The model: Fig. 2 in its order, from two images to what accumulates at every place.
+
+`difference` is the whole of it, and what every executor of `torch_vdm.run` is held to. The two
+observers differ in six places: the contrast sensitivity follows the local luminance or not
+(`Model.sights`), levels are divided by their gains or not (the constants), responses keep their
+sign or not (`torch_vdm.model.level`), the means of the images are compared or not
+(`Model.lowpass_difference`), border nodes count for the pixels that they have or not
+(``true_means``), and coarse differences are charged to the pixels that made them or not
+(`Model.charges`).
+"""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from torch_vdm.effects import Effects
+from torch_vdm.model import filtering
+from torch_vdm.model.aberration import attenuation
+from torch_vdm.model.charging import Charge, changes, charge
+from torch_vdm.model.cones import cone_responses
+from torch_vdm.model.contrast import opponents, weber_contrast
+from torch_vdm.model.cortex import Cortex, Transform
+from torch_vdm.model.cortex.haar import lowpass_of_light
+from torch_vdm.model.cortex.transform import Base, mean_of
+from torch_vdm.model.csf import barten, butterworth
+from torch_vdm.model.display import Display, linear_values
+from torch_vdm.model.distance import LARGEST_DIFFERENCE, Paths, accumulate
+from torch_vdm.model.grid import Before, Grid
+from torch_vdm.model.level import (
+    OF_LUMINANCE,
+    Level,
+    Levels,
+    Options,
+    Sight,
+    local_difference,
+    response,
+    sights_of,
+)
+from torch_vdm.model.matrix import product
+from torch_vdm.model.quadtree import push
+from torch_vdm.model.steps import PLAIN, Steps
+from torch_vdm.observer import Observer
+
+# A Butterworth filter's parameters.
+FILTER = ("gain", "cutoff", "order")
+
+
+class Model:
+    """What is computed of two images: the boxes of Fig. 2, with all that they depend on.
+
+    Parameters
+    ----------
+    display, observer, transform, effects
+        As in `torch_vdm.VDM`.
+    constants
+        Their numbers as tensors, in the precision of the computation and where it is done.
+    steps
+        How steps are called; one after the other by default.
+    """
+
+    def __init__(
+        self,
+        display: Display,
+        observer: Observer,
+        transform: Transform,
+        effects: Effects,
+        constants: Mapping[str, Tensor],
+        steps: Steps = PLAIN,
+    ) -> None:
+        self.display = display
+        self.observer = observer
+        self.transform = transform
+        self.effects = effects
+        self.constants = constants
+        self.steps = steps
+
+    # Of one image.
+
+    def represent(self, image: Tensor) -> Cortex:
+        """Return the cortex representation of an image (B, 3, H, W): display, cones, transform."""
+        return self.decomposed(self.cone_planes(image))
+
+    def cone_planes(self, image: Tensor) -> Tensor:
+        """Return the cone responses (B, 3, H, W) to an image: display, cone fundamentals."""
+        # From the display's primaries to cones at once: one mixing of all pixels instead of two.
+        matrix = self.constants["cones"]
+        if self.display.encoding != "xyz":
+            matrix = product(matrix, self.constants["primaries"]) * self.display.gain
+        # Numbers as tensors: compiled code is specialised on others.
+        around = self.display.encoding, self.display.limit(image), matrix
+        planes: Tensor = self.steps.pixels(lambda part: self.steps(_light, part, *around), image)
+        return planes
+
+    def decomposed(self, planes: Tensor) -> Cortex:
+        """Return the cortex representation of cone planes (B, 3, H, W)."""
+        return self.decomposed_of(self.filtered(planes), planes, mean_of(planes))
+
+    def decomposed_of(
+        self, source: Tensor, planes: Tensor, mean: Tensor, grid: Grid | None = None
+    ) -> Cortex:
+        """Return the same of what is `filtered`, the light that it is of, and the light's mean.
+
+        ``grid``: that of a part of an image.
+        """
+        cortex = self.transform.decompose(source, self.steps, self.observer.true_means, grid=grid)
+        if self.transform.csf == "levels":
+            return cortex
+        light = Base(planes, 0, _size(planes), mean)
+        return lowpass_of_light(cortex, light, self.observer.true_means)
+
+    def filtered(self, planes: Tensor, coarser: Tensor | None = None, finest: int = 0) -> Tensor:
+        """Return what is decomposed of cone planes: these, or their weighted contrast.
+
+        ``coarser`` and ``finest`` as `filtering.weighted_contrast`.
+        """
+        if self.transform.csf == "levels":
+            return planes
+        weights = self.band_weights()
+        pieces = self.steps.strips
+        return filtering.weighted_contrast(
+            planes, weights, self.constants, pieces, coarser, finest, self.steps
+        )
+
+    def band_weights(self) -> filtering.Weights:
+        """Return what weights the bands of an image that is filtered."""
+        frequency = self.constants["band_frequencies"]
+        bright = self._bright(frequency[None], torch.ones_like(frequency)[None])[0]
+        passed = self._passed(frequency)
+        local = self.observer.adaptation_luminance is None
+        return filtering.weights(self.constants, passed, bright, local, self.effects.chromatic)
+
+    def responses(self, cortex: Cortex) -> tuple[Tensor, ...]:
+        """Return the responses of one image, one (B, channels, orientations, h, w) a level.
+
+        From chromatic aberration to the transducer; level 0 first, 1 is threshold.
+        """
+        levels = self.levels(cortex.finest, len(cortex.details))
+        found = []
+        for number, detail in enumerate(cortex.details):
+            (sight,) = self.sights(levels.only(number), [cortex], number)
+            pushed = sight.pushed(_size(detail), before=cortex.before[number])
+            found.append(response(detail, pushed, self.options()))
+        return tuple(found)
+
+    # Of two.
+
+    def difference(self, test: Tensor, reference: Tensor) -> Tensor:
+        """Return the accumulated differences (B, 1, h, w) of two images, before the root."""
+        first, second = self.represent(test), self.represent(reference)
+        local = self.local_differences(first, second)
+        paths = Paths(local, self.changes(first, second), self.root(first, second))
+        return self.descended(paths, first.before)
+
+    def local_differences(self, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
+        """Return the local visual differences (Eq. 5), one (B, 1, h, w) a level, level 0 first."""
+        levels = self.levels(first.finest, len(first.details))
+        return tuple(
+            self.local_difference(first, second, number, levels.only(number))
+            for number in range(len(first.details))
+        )
+
+    def local_difference(self, first: Cortex, second: Cortex, number: int, level: Level) -> Tensor:
+        """Return the local visual difference (B, 1, h, w) of one level, the one of this number."""
+        details, others = first.details[number], second.details[number]
+        sight, other_sight = (
+            sight.pushed(_size(details), first.items, first.before[number])
+            for sight in self.sights(level, (first, second), number)
+        )
+        images = details, others, sight, other_sight
+        return local_difference(*images, self.options(), self.steps, first.items)
+
+    def lowpass_difference(self, first: Cortex, second: Cortex) -> Tensor:
+        """Return the weighted contrast between the means of two images, the lowpass term.
+
+        (B, channels, 1, 1), not negative, 1 at threshold; 0 for an observer that never compares
+        them. A uniform change is seen here and nowhere else.
+        """
+        one, other = first.mean, second.mean
+        if self.observer.lowpass_gains is None:
+            # Of the graph, so that an image of one pixel has a gradient.
+            return 0.0 * one[:, :1] + 0.0 * other[:, :1]
+        contrast = weber_contrast(one, other, self.constants["dark_cones"])
+        gains = self.constants["lowpass_gains"].view(-1, 1, 1)
+        weighted = opponents(contrast, self.constants["opponents"]) * gains
+        return weighted.abs().clamp_max(LARGEST_DIFFERENCE)
+
+    def root(self, first: Cortex, second: Cortex) -> Tensor:
+        """Return what every path begins with, (B, 1, 1, 1)."""
+        seen = self.lowpass_difference(first, second) ** self.constants["summation_exponent"]
+        return seen.sum(1, keepdim=True)
+
+    def changes(self, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
+        """Return the `charging.changes` of every level, level 0 first; none if none is charged."""
+        if not self.observer.charging:
+            return ()
+        return tuple(self.change(first, second, number) for number in range(len(first.details)))
+
+    def change(self, first: Cortex, second: Cortex, number: int) -> Tensor:
+        """Return the `charging.changes` (B, 1, h, w) at the nodes of one level."""
+        found: Tensor = self.steps(changes, first.lowpass[number], second.lowpass[number])
+        if not self.quartered:
+            return found
+        # The mean of the quarters that a node has.
+        top, left = first.grid.before(first.finest + len(first.details) - 1 - number)
+        height, width = _size(found)
+        sides = (left, (width + left) % 2, top, (height + top) % 2)
+        return functional.avg_pool2d(functional.pad(found, sides, mode="replicate"), 2)
+
+    @property
+    def quartered(self) -> bool:
+        """Whether lowpass planes have the quarters of nodes; see `lowpass_of_light`."""
+        return self.transform.csf == "filter" and self.transform.shifts == 1
+
+    def descended(self, paths: Paths, before: Sequence[Before], items: int = 1) -> Tensor:
+        """Return what has accumulated down the paths at their leaves, (B, 1, h, w)."""
+        charges = self.charges(paths.changes, items)
+        return accumulate(paths.local, paths.root, items, before, charges)
+
+    def charges(self, changes: Sequence[Tensor], items: int = 1) -> list[Charge] | None:
+        """Return what the nodes of each level are charged; None: all."""
+        if not self.observer.charging:
+            return None
+        options = self.transform.shifts, self.transform.csf == "filter", items
+        return [self.steps(charge, change, *options) for change in changes]
+
+    def grid(self, size: tuple[int, int]) -> Grid:
+        """Return where the nodes lie on an image of ``size`` = (H, W) pixels."""
+        return self.transform.grid(size, self.observer.true_means)
+
+    def to_pixels(self, plane: Tensor, size: tuple[int, int], grid: Grid | None = None) -> Tensor:
+        """Return a plane of leaves at the pixels; ``grid``: that of a part of an image."""
+        if self.transform.shifts > 1:  # the leaves of overlapping nodes are the pixels
+            return plane
+        grid = self.grid(size) if grid is None else grid
+        return push(plane, size, before=grid.before(0))
+
+    # What a level depends on.
+
+    def options(self) -> Options:
+        """Return what the boxes of a level depend on."""
+        return Options(
+            self.observer.signed,
+            self.effects.masking,
+            self.transform.phases,
+            self.transform.shifts > 1,
+            3 if self.effects.pooling else 1,
+            self.constants["opponents"],
+            self.constants["transducer_exponent"],
+            self.constants["summation_exponent"],
+        )
+
+    def sights(self, level: Level, images: Sequence[Cortex], number: int) -> list[Sight]:
+        """Return the sight of a level, the one of this number, for each image, at its parents."""
+        if self.transform.csf == "filter":
+            return [weights_alone(level)] * len(images)
+        parents = [cortex.parent_lowpass(number) for cortex in images]
+        sights: list[Sight] = self.steps(sights_of, parents, level, *self.sight_options())
+        return sights
+
+    def sight_options(self) -> tuple[dict[str, Tensor], bool, bool]:
+        """Return what `sights_of` takes beside parents and level."""
+        local = self.observer.adaptation_luminance is None
+        # No more than it needs: a compiled function checks every tensor that it is given.
+        names = ("dark_cones", *(OF_LUMINANCE if local else ()))
+        return {name: self.constants[name] for name in names}, local, self.effects.chromatic
+
+    def levels(self, finest: int, count: int) -> Levels:
+        """Return what ``count`` levels respond to, from the level ``finest``; the coarsest first.
+
+        All levels at once: on small images the operations of a level cost more than its numbers.
+        """
+        some = slice(finest, finest + count)
+        frequency, gain = (self.constants[name][some].flip(0) for name in ("frequencies", "gains"))
+        passed = self._passed(frequency[:, 0])
+        return Levels(passed, frequency, gain, self._bright(frequency, gain))
+
+    def _passed(self, frequency: Tensor) -> Tensor:
+        """Return the share (levels, 3) of the cones' details that chromatic aberration leaves."""
+        if not self.effects.aberration:
+            return torch.ones_like(frequency).unsqueeze(1).expand(-1, 3)
+        of_eye = self.constants["aberration_cutoff"], self.constants["aberration_exponent"]
+        return attenuation(frequency, *of_eye)
+
+    def _bright(self, frequency: Tensor, gain: Tensor) -> Tensor:
+        """Return the sensitivity of all channels, or of C1 and C2 where the luminance is local.
+
+        (levels, channels, as many) from (levels, as many); in bright light, over the gain.
+        """
+        of, channels = self.constants, []
+        if self.observer.adaptation_luminance is not None:
+            luminance, size = of["adaptation_luminance"], of["achromatic_size"]
+            channels = [of["achromatic_gain"] * barten(frequency, luminance, size)]
+        if self.effects.chromatic:
+            channels += [
+                butterworth(frequency, *(of[f"{name}_{part}"] for part in FILTER))
+                for name in ("red_green", "yellow_violet")
+            ]
+        return torch.stack(channels, 1) / gain.unsqueeze(1) if channels else gain.unsqueeze(1)
+
+
+def weights_alone(level: Level) -> Sight:
+    """Return the sight of a level of filtered images: of details that are contrasts already."""
+    return Sight(None, (1.0 / level.gain)[None, None])
+
+
+def _light(image: Tensor, encoding: str, limit: Tensor | None, matrix: Tensor) -> Tensor:
+    """Return the cone responses (B, 3, H, W) to an image; ``matrix`` is of linear values."""
+    return cone_responses(linear_values(image, encoding, limit), matrix)
+
+
+def _size(plane: Tensor) -> tuple[int, int]:
+    return plane.shape[-2], plane.shape[-1]

@@ -1,0 +1,1 @@
+"""How the model is computed: executors, each of which gives what `Model.difference` gives."""

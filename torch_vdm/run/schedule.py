@@ -1,0 +1,140 @@
+"""How a pair of images is computed: chosen in one place, from what is known before it is."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from torch_vdm.model.cortex import bands
+from torch_vdm.model.steps import Steps
+from torch_vdm.run.compiled import SMALLEST, compiled
+from torch_vdm.run.tiling import Tiling, cut
+
+# Planes with more numbers are computed in parts, which stay in a processor's cache. Status:
+# choice, measured.
+LARGEST_AT_ONCE = 2**18
+
+# Pixels of a strip of a large image, and how many levels, from the finest, are computed in strips.
+# Status: choice, measured.
+STRIP, STRIP_LEVELS = 2**19, 2
+
+# Pixels of a strip in which a large image is filtered. Status: choice, measured.
+BAND_STRIP = 2**17
+
+# Levels of at most as many nodes are computed at once: there an operation costs more than the
+# numbers that it works on. Status: choice, measured.
+FEW_NODES = 64 * 64
+
+
+class Job(NamedTuple):
+    """What decides how a pair is computed."""
+
+    items: int
+    size: tuple[int, int]
+    stackable: bool
+    """Whether items may lie below one another: with `Haar` alone."""
+    gradients: bool
+    """Whether a backward pass may follow."""
+    compiles: bool
+    """Whether the compiled route was asked for."""
+    checkpoints: bool
+    """Whether little is to be kept for the backward pass."""
+    traced: bool
+    """Whether somebody else makes a graph of it, which is one whatever its pieces are."""
+
+
+@dataclass(frozen=True)
+class Schedule(Steps):
+    """How a pair is computed."""
+
+    pieces: Literal["whole", "strips"] = "whole"
+    """How the finest levels of an image are cut."""
+    stacked: bool = False
+    """Whether the items of a batch lie below one another in planes of one."""
+    compiled: bool = False
+    """Whether large steps are compiled."""
+    again: bool = False
+    """Whether the backward pass computes parts again, of which their arguments are kept."""
+    few: int = field(default_factory=lambda: FEW_NODES)
+    """Levels of at most so many nodes are computed at once."""
+
+    def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return what a step returns, by its compiled form where that pays."""
+        if self.compiled and _first(arguments).numel() >= SMALLEST:
+            return compiled(function)(*arguments)
+        return function(*arguments)
+
+    def part(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return what several steps return; compiled graphs choose by themselves what they keep."""
+        if not self.again or not torch.is_grad_enabled():
+            return function(*arguments)
+        return checkpoint(function, *arguments, use_reentrant=False, preserve_rng_state=False)
+
+    def pixels(self, function: Callable[..., Tensor], *planes: Tensor) -> Tensor:
+        """Return a function of pixels, a few rows at a time."""
+        if self.compiled:
+            return function(*planes)
+        rows = self.rows(planes[0].shape[-2], planes[0].numel(), LARGEST_AT_ONCE)
+        parts = zip(*(plane.split(rows, -2) for plane in planes), strict=True)
+        return torch.cat([self.part(function, *part) for part in parts], -2)
+
+    def strips(
+        self, function: Callable[[Tensor], tuple[Tensor, Tensor]], plane: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return `filtering`'s function of a plane; of a large one in strips."""
+        size = plane.shape[-2], plane.shape[-1]
+        few = math.prod(size) < 2 * BAND_STRIP
+        if few or self.compiled or torch.compiler.is_compiling():
+            whole: tuple[Tensor, Tensor] = self.part(function, plane)
+            return whole
+        tiling = Tiling.strips(size, BAND_STRIP, 0, 1, bands.REACH)
+        pieces = []
+        for strip, around in zip(tiling, tiling.split_rows(plane), strict=True):
+            found = self.part(function, around)
+            pieces.append([cut(part, strip.within(n)) for n, part in enumerate(found, 1)])
+        contrast, lowpass = (torch.cat(parts, -2) for parts in zip(*pieces, strict=True))
+        return contrast, lowpass
+
+    def rows(self, height: int, numbers: int, most: int) -> int:
+        """Return how many of ``height`` rows, ``numbers`` numbers in all, are computed at once."""
+        return height if self.compiled else max(1, most * height // numbers)
+
+
+def chosen(job: Job) -> Schedule:
+    """Return how a job is best done."""
+    # With gradients strips take less memory and more time, as checkpoints do.
+    large = math.prod(job.size) >= 2 * STRIP
+    strips = large and not job.traced and (job.checkpoints or not job.gradients)
+    compiles = job.compiles and not job.traced
+    return Schedule(
+        "strips" if strips else "whole",
+        stacked=compiles and job.items > 1 and job.stackable,
+        compiled=compiles,
+        again=job.checkpoints and job.gradients and not job.traced,
+        few=FEW_NODES,
+    )
+
+
+def at_once(job: Job) -> int:
+    """Return how many items of a batch are computed at once.
+
+    Compiled code for one item serves a batch that is stacked: as many pixels as are not yet cut in
+    strips, and so few items that their planes of 2x2 nodes are not compiled: another form would be,
+    for a side that becomes 1.
+    """
+    if not job.compiles or job.traced:
+        return job.items
+    if not job.stackable:
+        return 1
+    return min(max(1, 2 * STRIP // math.prod(job.size)), SMALLEST // 16)
+
+
+def _first(arguments: tuple[Any, ...]) -> Tensor:
+    """Return the first plane of the arguments of a step."""
+    first = arguments[0]
+    plane: Tensor = first if isinstance(first, Tensor) else first[0]
+    return plane

@@ -1,0 +1,261 @@
+"""Images larger than memory, one tile at a time.
+
+A tile begins where a node of the coarsest level that it is cut for has its parent, and comes with
+all that its nodes, their parents and their neighbours in pooling are made of. Its levels are then a
+part of the image's, and everything else about it is cut off. The coarser levels go on from a plane
+that the tiles leave, no larger than one of them.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import count
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_vdm.model.charging import AROUND, Charge
+from torch_vdm.model.cortex import Cortex, bands
+from torch_vdm.model.cortex.haar import lowpass_of_light
+from torch_vdm.model.cortex.transform import Base, mean_of
+from torch_vdm.model.distance import accumulate, just_noticeable
+from torch_vdm.model.grid import Grid
+from torch_vdm.model.model import Model
+from torch_vdm.precision import widest
+from torch_vdm.run.schedule import Schedule
+from torch_vdm.run.tiling import Slices, Source, Tile, Tiling, check_sources, cut, read
+from torch_vdm.run.whole import differences
+
+# Called with how many steps are done, and of how many.
+Progress = Callable[[int, int], None]
+
+# Takes parts of a test and a reference, (1, 3, h, w), and the item, y and x of their first pixel;
+# returns both as the model takes them, and where they are finite, if that is asked.
+Check = Callable[[Tensor, Tensor, tuple[int, int, int]], tuple[Tensor, Tensor, Tensor | None]]
+
+
+class Done(NamedTuple):
+    """A tile, and what has accumulated down the paths to its leaves, (1, 1, h, w)."""
+
+    item: int
+    part: Slices
+    grid: Grid
+    total: Tensor
+    seen: Tensor | None
+
+    def jnd(self, model: Model) -> Tensor:
+        """Return the map (1, 1, h, w) of the tile."""
+        jnd = just_noticeable(self.total, model.constants["summation_exponent"])
+        rows, columns = self.part
+        size = rows.stop - rows.start, columns.stop - columns.start
+        return model.to_pixels(jnd, size, self.grid)
+
+
+class _Pair(NamedTuple):
+    """The same part of a test and a reference."""
+
+    planes: list[Tensor]
+    """The cone responses to each."""
+    seen: Tensor | None
+    """Where both are finite, if that is asked."""
+
+
+def in_tiles(
+    model: Model,
+    schedule: Schedule,
+    sources: tuple[Source, Source],
+    side: int,
+    check: Check,
+    square: int = 1,
+    progress: Progress | None = None,
+) -> Iterator[Done]:
+    """Yield what accumulates down the paths to the leaves of every tile of a test and a reference.
+
+    ``side``: pixels a side of a tile, at most. ``square``: parts are checked in whole squares of so
+    many pixels. ``progress`` as `VDM.tiled`.
+    """
+    items, size = check_sources(*sources)
+    transform, shifts = model.transform, model.transform.shifts
+    # Spatial pooling takes in fewer nodes than charging does.
+    nodes = transform.reach + AROUND * shifts
+    grid = model.grid(size)
+    tiling = Tiling.fit(size, side, shifts, nodes, grid)
+    filtered = transform.csf == "filter" and not tiling.whole
+    plain = tiling.plain(bands.halo(_scales(tiling)))
+    device = model.constants["summation_exponent"].device
+    steps = count(1)
+    passes = len(tiling) * (1 if tiling.whole else 2) + filtered * len(plain)
+
+    def images(item: int, part: Slices) -> _Pair:
+        wide = _in_squares(part, size, square)
+        one, other = (read(source, item, wide).to(device) for source in sources)
+        one, other, seen = check(one, other, (item, wide[0].start, wide[1].start))
+        if wide != part:
+            inside = Tile(part, wide).within(1)
+            one, other = cut(one, inside), cut(other, inside)
+            seen = None if seen is None else cut(seen, inside)
+        return _Pair([model.cone_planes(one), model.cone_planes(other)], seen)
+
+    def step() -> None:
+        if progress is not None:
+            progress(next(steps), items * passes)
+
+    for item in range(items):
+        read_part = partial(images, item)
+        contrasts: list[Tensor] | None = None
+        coarse = None
+        if filtered:
+            contrasts = _coarse_contrasts(model, schedule, read_part, plain, step)
+        if not tiling.whole:
+            representations = _coarse(model, schedule, read_part, tiling, contrasts, step)
+            before = representations[0].before
+            coarse = model.descended(differences(model, schedule, *representations), before)
+        for tile in tiling:
+            around = _around(tile, tiling, contrasts)
+            planes, seen = read_part(around.part)
+            first, second = (
+                _decomposed(model, cones, contrast, around.inner, tiling.grid_of(tile.around))
+                for cones, contrast in zip(planes, around.contrasts, strict=True)
+            )
+            paths = differences(model, schedule, first, second)
+            part_grid = tiling.grid_of(tile.part)
+            if coarse is None:
+                total = model.descended(paths, first.before)
+                yield Done(item, tile.part, part_grid, total, seen)
+                step()
+                continue
+            places = [tile.within(2 ** (level + 1) // shifts) for level in range(tiling.levels)][
+                ::-1
+            ]
+            fine = slice(-tiling.levels, None)
+            local = list(map(cut, paths.local[fine], places))
+            charges = model.charges(paths.changes[fine])
+            if charges is not None:
+                charges = [
+                    Charge(
+                        cut(charge.inherited, place),
+                        None if charge.own is None else cut(charge.own, place),
+                    )
+                    for charge, place in zip(charges, places, strict=True)
+                ]
+            total = cut(coarse, tile.of_image(2 ** (tiling.levels + 1) // shifts))
+            seen = None if seen is None else cut(seen, around.pixels)
+            before = part_grid.down(len(local))
+            total = accumulate(local, total, before=before, charges=charges)
+            yield Done(item, tile.part, part_grid, total, seen)
+            step()
+
+
+def _decomposed(
+    model: Model, planes: Tensor, coarser: Tensor | None, part: Slices | None, grid: Grid
+) -> Cortex:
+    """Return the cortex representation of a ``part`` of cone planes, or of all."""
+    source, mean = model.filtered(planes, coarser), mean_of(planes)
+    if part is not None:
+        source, planes = cut(source, part), cut(planes, part)
+    return model.decomposed_of(source, planes, mean, grid)
+
+
+def _coarse_contrasts(
+    model: Model,
+    schedule: Schedule,
+    images: Callable[[Slices], _Pair],
+    tiling: Tiling,
+    step: Callable[[], None],
+) -> list[Tensor]:
+    """Return the weighted contrast of both images without their `_scales`."""
+    scales = _scales(tiling)
+    planes: tuple[list[Tensor], list[Tensor]] = [], []
+    for tile in tiling:
+        for tiles, cones in zip(planes, images(tile.around).planes, strict=True):
+            left = bands.lowpass(cones, scales, schedule)
+            tiles.append(cut(left, tile.within(2**scales)))
+        step()
+    return [model.filtered(tiling.joined(tiles), finest=scales) for tiles in planes]
+
+
+def _coarse(
+    model: Model,
+    schedule: Schedule,
+    images: Callable[[Slices], _Pair],
+    tiling: Tiling,
+    contrasts: list[Tensor] | None,
+    step: Callable[[], None],
+) -> list[Cortex]:
+    """Return the levels of both images that are coarser than those of tiles."""
+    octaves = tiling.levels - 1
+    options = schedule, model.observer.true_means
+    filtered = contrasts is not None
+    # For each image: the tiles of its lowpass pyramid, those of its light's, and the sum of
+    # its pixels.
+    planes: tuple[list[Tensor], list[Tensor]] = [], []
+    lights: tuple[list[Tensor], list[Tensor]] = [], []
+    sums = [torch.zeros(1, 1, 1, 1)] * 2
+    for tile in tiling:
+        around = _around(tile, tiling, contrasts)
+        grid = tiling.grid_of(tile.around)
+        for number, cones in enumerate(images(around.part).planes):
+            source = model.filtered(cones, around.contrasts[number])
+            source = source if around.inner is None else cut(source, around.inner)
+            reduced = model.transform.reduced(source, octaves, *options, grid=grid)
+            planes[number].append(cut(reduced, tile.within(2**octaves)))
+            if filtered:
+                inner = cones if around.inner is None else cut(cones, around.inner)
+                reduced = model.transform.reduced(inner, octaves, *options, grid=grid)
+                lights[number].append(cut(reduced, tile.within(2**octaves)))
+            inside = cut(cones, around.pixels).to(widest(cones.device))
+            inside = inside.sum((-2, -1), keepdim=True)
+            sums[number] = sums[number].to(inside) + inside
+        step()
+    pixels = math.prod(tiling.size)
+    coarse = []
+    for tiles, of_light, total in zip(planes, lights, sums, strict=True):
+        plane = tiling.joined(tiles)
+        base = Base(plane, octaves, tiling.size, (total / pixels).to(plane))
+        cortex = model.transform.resume(base, *options)
+        if filtered:
+            base = base._replace(plane=tiling.joined(of_light))
+            cortex = lowpass_of_light(cortex, base, model.observer.true_means)
+        coarse.append(cortex)
+    return coarse
+
+
+def _in_squares(part: Slices, size: tuple[int, int], square: int) -> Slices:
+    """Return a part made larger to whole squares of so many pixels."""
+    rows, columns = (
+        slice(side.start // square * square, min(-(-side.stop // square) * square, length))
+        for side, length in zip(part, size, strict=True)
+    )
+    return rows, columns
+
+
+def _scales(tiling: Tiling) -> int:
+    """Return how many scales are filtered in tiles: fewer than levels, for they reach further."""
+    return max(tiling.levels - 2, 1)
+
+
+class _Around(NamedTuple):
+    """What a tile is computed from."""
+
+    part: Slices
+    """What is read: the tile with its halo, and of a filtered image with what its filter needs."""
+    inner: Slices | None
+    """Where in it lie the tile and its halo, if that is not all."""
+    pixels: Slices
+    """Where in it lie the tile's own pixels."""
+    contrasts: list[Tensor] | list[None]
+    """What `_coarse_contrasts` gives there, for each image."""
+
+
+def _around(tile: Tile, tiling: Tiling, contrasts: list[Tensor] | None) -> _Around:
+    """Return what a tile is computed from, where ``contrasts`` are those of the whole images."""
+    if contrasts is None:
+        return _Around(tile.around, None, tile.within(1), [None, None])
+    # Wherever the nodes lie, a filter's samples lie where those of the paper's grid do.
+    scales = _scales(tiling)
+    wide = tiling.wider(tile, bands.halo(scales))
+    whole = Tile(wide.around, wide.around)
+    coarser = [cut(contrast, whole.of_image(2**scales)) for contrast in contrasts]
+    pixels = Tile(tile.part, wide.around).within(1)
+    return _Around(wide.around, wide.within(1), pixels, coarser)
