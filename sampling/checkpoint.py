@@ -35,6 +35,7 @@ WORDS = {
     "white": "--white",
     "observer": "--observer",
     "aov": "--aov",
+    "filter": "--filter",
 }
 
 

@@ -15,9 +15,11 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import torch
 
 from sampling import checkpoint
+from sampling.renderers.filter import FILTERS, SCENE
 from sampling.renderers.mitsuba import VARIANTS, MitsubaRenderer
 from sampling.sampler import Report, Sampler, Settings, under
 from sampling.strategies import STRATEGIES
@@ -113,6 +115,12 @@ def _parser() -> argparse.ArgumentParser:
         "--aov",
         action="store_true",
         help="write albedo, shading normal and depth, from the same rays",
+    )
+    scene.add_argument(
+        "--filter",
+        choices=FILTERS,
+        default=SCENE,
+        help="reconstruction filter of the pixels; scene: its film's own (scene)",
     )
     scene.add_argument(
         "--variant", choices=("auto", *VARIANTS), default="auto", help="of Mitsuba (auto)"
@@ -258,10 +266,16 @@ class _Job:
         for name, plane in zip("RGB", np.moveaxis(sampler.variance, -1, 0), strict=True):
             planes[f"variance.{name}"] = plane
         planes |= self.renderer.aovs()
-        write_channels(
-            self.options.output,
-            {name: torch.tensor(plane, dtype=torch.float32) for name, plane in planes.items()},
-        )
+        tensors = {name: torch.tensor(p, dtype=torch.float32) for name, p in planes.items()}
+        header = {
+            "software": f"vdm-render {__version__}",
+            "pixelFilter": self.renderer.pixel_filter.words,
+        }
+        with atomic_path(self.options.output) as temporary:
+            write_channels(temporary, tensors)
+            with OpenEXR.File(str(temporary), separate_channels=True) as file:
+                file.header().update(header)
+                file.write(str(temporary))
 
     def figures(self, reason: str) -> dict[str, Any]:
         """Return what the JSON says."""
@@ -298,6 +312,7 @@ class _Job:
             "ppd": options.ppd,
             "white": options.white,
             "observer": options.observer,
+            "filter": options.filter,
             "scene": str(options.scene),
             "version": __version__,
             "mitsuba": self.renderer.version,
@@ -323,6 +338,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
             dict(options.parameters),
             seed=options.seed,
             aov=options.aov,
+            filter=options.filter,
             variant=options.variant,
         )
     for warning in told:
@@ -338,6 +354,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         "size": f"{width} x {height}",
         "scene": renderer.fingerprint,
         **{name: getattr(options, name) for name in ("seed", "ppd", "white", "observer")},
+        "filter": options.filter,
         "aov": options.aov,
     }
     kept = options.checkpoint or options.output.with_name(f"{options.output.name}.checkpoint")
@@ -438,7 +455,7 @@ def _reproduce(options: argparse.Namespace) -> str:
         value = getattr(options, name)
         if value is not None:
             words += [f"--{name.replace('_', '-')}", str(value)]
-    for name in ("ppd", "white", "observer", "effects", "variant"):
+    for name in ("ppd", "white", "observer", "effects", "filter", "variant"):
         words += [f"--{name}", str(getattr(options, name))]
     words += [f"--{name}" for name in ("unbiased", "aov") if getattr(options, name)]
     for name, value in options.parameters:
@@ -485,8 +502,8 @@ def _text(figures: dict[str, Any], options: argparse.Namespace) -> str:
     depth = "no limit of depth" if plan["max_depth"] is None else f"depth {plan['max_depth']}"
     simulated = [each["effect"] for each in plan["effects"] if each["simulated"]]
     lines += [
-        f"simulated: {plan['integrator']}, {depth}, {figures['variant']}"
-        + "".join(f", {effect}" for effect in simulated),
+        f"simulated: {plan['integrator']}, {depth}, {figures['variant']}, "
+        f"{plan['pixel_filter']} filter" + "".join(f", {effect}" for effect in simulated),
         f"assumed: {options.ppd:g} pixels per degree (--ppd)",
         f"assumed: 1.0 is {options.white:g} cd/m2 (--white)",
         f"assumed: the {options.observer} observer (--observer)",

@@ -90,12 +90,13 @@ def moments(samples: Samples, count: int) -> tuple[NDArray[np.float64], NDArray[
     return radiance.mean(1), radiance.var(1, ddof=1) / count
 
 
+@pytest.mark.parametrize("rfilter", ["box", "gaussian", "lanczos"])
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"])
 def test_sample_k_of_a_pixel_is_the_same_number_however_it_is_drawn(
-    scene: tuple[Path, dict[str, str]], variant: str
+    scene: tuple[Path, dict[str, str]], variant: str, rfilter: str
 ) -> None:
     path, parameters = scene
-    options: dict[str, Any] = {"seed": 5, "variant": variant}
+    options: dict[str, Any] = {"seed": 5, "variant": variant, "filter": rfilter}
     whole = MitsubaRenderer(path, parameters, **options)
     samples = draw(whole, 7)
     wanted = samples.radiance.reshape(-1, 7, 3)

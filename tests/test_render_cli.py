@@ -108,6 +108,26 @@ def test_the_image_and_the_figures(whole: tuple[list[str], Path]) -> None:
     np.testing.assert_array_equal(
         load(output).pixels.numpy(), np.stack([planes[name] for name in "RGB"])
     )
+    assert (told["filter"], told["plan"]["pixel_filter"]) == ("scene", "box")
+    assert OpenEXR.File(str(output)).header()["pixelFilter"].startswith("BoxFilter")
+
+
+def test_a_filter_is_chosen_and_told(scene: str, tmp_path: Path) -> None:
+    output = tmp_path / "out.exr"
+    words = [scene, *SMALL, "--max-spp", "16", "--aov", "--filter", "lanczos"]
+    assert main([*words, "--output", str(output), "--json", f"{output}.json"]) == 0
+    told = figures(Path(f"{output}.json"))
+    assert (told["filter"], told["plan"]["pixel_filter"]) == ("lanczos", "lanczos")
+    assert OpenEXR.File(str(output)).header()["pixelFilter"] == "LanczosSincFilter[lobes=3.000000]"
+    # The picture is the mean of samples of that filter.
+    renderer = MitsubaRenderer(scene, {"width": "12", "height": "8"}, filter="lanczos")
+    pixels = np.arange(96)
+    drawn = renderer.sample(pixels, 0 * pixels, 0 * pixels + 16)
+    mean = drawn.radiance.reshape(8, 12, 16, 3).mean(2, np.float64)
+    planes = channels(output)
+    np.testing.assert_allclose(
+        np.stack([planes[name] for name in "RGB"], -1), mean, rtol=1e-5, atol=1e-6
+    )
 
 
 def test_the_image_is_the_mean_of_the_pixels_samples(whole: tuple[list[str], Path]) -> None:
@@ -253,6 +273,7 @@ def test_a_checkpoint_of_another_run_is_refused(
             ("--max-spp", "16", "--seed", "8", "--effects", "full"),
             "begun with --seed 7, and this is 8",
         ),
+        (("--max-spp", "16", "--filter", "tent"), "begun with --filter scene, and this is tent"),
         (("--max-spp", "16", "-D", "depth=3"), "another scene"),
         (("--max-spp", "16", "-D", "width=13"), "begun with image size 12 x 8"),
     ):
@@ -338,6 +359,7 @@ def test_what_is_not_finite_is_told(
         (("SCENE", "--max-spp", "1.5"), "expected a whole number over 0"),
         (("SCENE", "--seed", "-1"), "--seed"),
         (("SCENE", "--seed", "4294967296"), "expected a whole number from 0 to 4294967295"),
+        (("SCENE", "--filter", "sinc"), "--filter"),
         (("SCENE", "--noise-threshold", "0.1"), "expected the halfbuffer strategy"),
         (("SCENE", "--output", "out.png"), "out.png: expected a name that ends in .exr"),
         (("SCENE", "--output", "nowhere/out.exr"), "expected the folder to exist"),

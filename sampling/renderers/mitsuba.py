@@ -1,8 +1,8 @@
 """Mitsuba as the renderer: single pixels of a scene, sample by sample.
 
-The only file that imports mitsuba. Each sample is a ray through a pixel, followed by the scene's
-own integrator; its random numbers come from the pixel, the number of the sample and the seed. The
-film, its filter and the scene's sampler are left out: pixels are boxes, and their samples are
+The only file that imports mitsuba. Each sample is a ray through a place that is drawn from the
+pixel's filter, followed by the scene's own integrator; its random numbers come from the pixel, the
+number of the sample and the seed. The film and the scene's sampler are left out: samples are
 independent, as the statistics take them to be.
 """
 
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sampling.renderers import hemisphere
+from sampling.renderers.filter import FILTERS, SCENE, PixelFilter
 from sampling.renderers.llvm import OLDEST, PACKAGE, VARIABLE, find_llvm
 from sampling.renderers.protocol import Samples
 
@@ -56,6 +57,8 @@ class MitsubaRenderer:
     aov
         Whether albedo, shading normal and depth are averaged in the same pass; depth is the length
         of the ray, in the scene's units, and 0 where it hits nothing.
+    filter
+        One of `FILTERS`: the film's own, or another of Mitsuba's by name, as it is by default.
     variant
         One of `VARIANTS`, or "auto": a GPU where there is one, else compiled code where there is an
         LLVM, else the interpreted variant, with a warning.
@@ -68,6 +71,8 @@ class MitsubaRenderer:
         The variant in use, and the version of Mitsuba.
     size
         Height and width of the image, in pixels: the film's crop.
+    pixel_filter
+        The filter; its ``rays`` says how many each sample takes.
     fingerprint
         A hash of the scene's file, of every file that it names, and of the parameters.
     aov_sums
@@ -90,11 +95,14 @@ class MitsubaRenderer:
         *,
         seed: int = 0,
         aov: bool = False,
+        filter: str = SCENE,  # noqa: A002  # what --filter is called
         variant: str = "auto",
         batch: int = BATCH,
     ) -> None:
         if not 0 <= seed < 2**32:
             raise ValueError(f"expected a seed from 0 to {2**32 - 1}, got {seed}")
+        if filter not in FILTERS:
+            raise ValueError(f"expected a filter among {', '.join(FILTERS)}, got {filter!r}")
         self.path = Path(scene)
         if not self.path.is_file():
             what = "a folder or a device" if self.path.exists() else "no such file"
@@ -119,8 +127,14 @@ class MitsubaRenderer:
         self.size = height, width
         self._integrator = self._sampling_integrator()
         self._named = _integrator_names(self._mi, state)
-        filters = _nodes(self._mi, state, "ReconstructionFilter")
-        self._filter = filters[0].plugin_name() if filters else "gaussian (Mitsuba's default)"
+        film = self._sensor.film()
+        self.filter = filter
+        self.pixel_filter = PixelFilter(
+            self._mi,
+            importlib.import_module("drjit"),
+            film,
+            film.rfilter() if filter == SCENE else self._mi.load_dict({"type": filter}),
+        )
         self._aov_at = 0
         self.aov_sums: NDArray[np.float64] | None = None
         if aov:
@@ -143,8 +157,9 @@ class MitsubaRenderer:
         radiance = np.empty((len(which), 3), np.float32)
         self._mi.set_variant(self.variant)  # someone else may have chosen another one
         draw = self._draw_one_by_one if self.variant.startswith("scalar") else self._draw
-        for begin in range(0, len(which), self._batch):
-            part = slice(begin, begin + self._batch)
+        at_once = max(self._batch // self.pixel_filter.rays, 1)
+        for begin in range(0, len(which), at_once):
+            part = slice(begin, begin + at_once)
             try:
                 radiance[part], aovs = draw(which[part], number[part])
             except RuntimeError as error:
@@ -159,17 +174,20 @@ class MitsubaRenderer:
     ) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
         """Draw samples in one call of compiled code."""
         mi, dr = self._mi, importlib.import_module("drjit")
-        drawn = len(pixels)
+        drawn, rays = len(pixels), self.pixel_filter.rays
         if drawn == 1:  # a width of one is compiled anew
             pixels, numbers = pixels.repeat(2), numbers.repeat(2)
-        pixel = mi.UInt32(pixels.astype(np.uint32))
+        ray = dr.arange(mi.UInt32, rays * len(pixels))
+        pixel = mi.UInt32(pixels.astype(np.uint32).repeat(rays))
+        number = mi.UInt32(numbers.astype(np.uint32).repeat(rays))
         sampler = _pixel_sampler(self.variant)
-        sampler.start(pixel, mi.UInt32(numbers.astype(np.uint32)), dr.opaque(mi.UInt32, self.seed))
+        sampler.start(pixel, number, dr.opaque(mi.UInt32, self.seed))
         width = self.size[1]
-        radiance, aovs = self._follow(sampler, mi.Float(pixel % width), mi.Float(pixel // width))
+        # Of two rays the second is taken off.
+        radiance, aovs = self._follow(sampler, pixel % width, pixel // width, (ray & 1) == 1)
         dr.eval(radiance, aovs)
-        planes = [np.asarray(plane.numpy())[:drawn] for plane in aovs]
-        return np.asarray(radiance.numpy()).T[:drawn], planes
+        planes = [np.asarray(plane.numpy()).reshape(-1, rays).sum(1)[:drawn] for plane in aovs]
+        return np.asarray(radiance.numpy()).T.reshape(-1, rays, 3).sum(1)[:drawn], planes
 
     def _draw_one_by_one(
         self, pixels: NDArray[np.int64], numbers: NDArray[np.int64]
@@ -182,22 +200,23 @@ class MitsubaRenderer:
         mi = self._mi
         sampler = mi.load_dict({"type": "independent"})
         width = self.size[1]
-        radiance = np.empty((len(pixels), 3), np.float32)
-        aovs = np.empty((len(pixels), len(AOV_NAMES) if self.aov_sums is not None else 0))
+        radiance = np.zeros((len(pixels), 3), np.float32)
+        aovs = np.zeros((len(pixels), len(AOV_NAMES) if self.aov_sums is not None else 0))
         for i, (pixel, number) in enumerate(zip(pixels.tolist(), numbers.tolist(), strict=True)):
             high, low = mi.sample_tea_32(pixel, self.seed)
-            sampler.seed(mi.sample_tea_32((high + number) % 2**32, low)[0], 1)
-            light, values = self._follow(sampler, float(pixel % width), float(pixel // width))
-            radiance[i] = light
-            aovs[i] = values
+            for negative in (False, True)[: self.pixel_filter.rays]:
+                sampler.seed(mi.sample_tea_32((high + number) % 2**32, low)[0], 1)
+                light, values = self._follow(sampler, pixel % width, pixel // width, negative)
+                radiance[i] += light
+                aovs[i] += values
         return radiance, list(aovs.T.astype(np.float32))
 
-    def _follow(self, sampler: Any, x: Any, y: Any) -> tuple[Any, list[Any]]:
-        """Return the light along a random ray through each pixel, and the pixel's AOVs."""
+    def _follow(self, sampler: Any, x: Any, y: Any, negative: Any) -> tuple[Any, list[Any]]:
+        """Return the light along a random ray for each pixel, and its AOVs, both weighted."""
         mi, sensor = self._mi, self._sensor
         height, width = self.size
-        offset = sampler.next_2d()
-        position = mi.Point2f((x + offset.x) * (1.0 / width), (y + offset.y) * (1.0 / height))
+        place = self.pixel_filter.place(sampler, x, y, negative)
+        position = mi.Point2f(place.x * (1.0 / width), place.y * (1.0 / height))
         lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         time = mi.Float(sensor.shutter_open())
         if sensor.shutter_open_time() > 0.0:
@@ -208,7 +227,7 @@ class MitsubaRenderer:
             self._scene, sampler, ray, sensor.get_medium(), True
         )
         wanted = aovs[self._aov_at :] if self.aov_sums is not None else []
-        return weight * light, wanted
+        return weight * light * place.weight, [plane * place.weight for plane in wanted]
 
     def _parse(self) -> Any:
         """Read the file and what it includes, and hash all of it."""
@@ -296,7 +315,14 @@ class MitsubaRenderer:
 
     def plan(self) -> dict[str, Any]:
         """Return what is simulated and why, for the JSON."""
-        return _plan(self._mi, self._scene, self._sensor, self._named, self._filter)
+        return _plan(self._mi, self._scene, self._sensor, self._named) | {
+            "pixel_filter": self.pixel_filter.name,
+            "pixel_filter_why": (
+                f"{'the film has' if self.filter == SCENE else 'asked for:'} "
+                f"{self.pixel_filter.words}; rays are placed by it, "
+                f"{self.pixel_filter.rays} a sample"
+            ),
+        }
 
 
 def load_mitsuba(variant: str = "auto") -> Any:
@@ -427,9 +453,7 @@ def _integrator_names(mi: Any, state: Any) -> tuple[str, int | None]:
     return inner[-1].plugin_name(), depth if depth >= 0 else None
 
 
-def _plan(
-    mi: Any, scene: Any, sensor: Any, integrator: tuple[str, int | None], rfilter: str
-) -> dict[str, Any]:
+def _plan(mi: Any, scene: Any, sensor: Any, integrator: tuple[str, int | None]) -> dict[str, Any]:
     """Return what is simulated and why."""
     name, depth = integrator
     shapes = scene.shapes()
@@ -485,8 +509,6 @@ def _plan(
         "integrator": name,
         "max_depth": depth,
         "sensor": f"the first of {len(scene.sensors())}",
-        "pixel_filter": "box",
-        "pixel_filter_why": f"samples of a pixel stay in it; the scene's film asks for {rfilter}",
         "effects": [
             {"effect": effect, "simulated": simulated, "why": why}
             for effect, simulated, why in effects
