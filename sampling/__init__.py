@@ -1,6 +1,18 @@
 """Adaptive rendering: samples go where their error would be seen (Section 3 of the paper)."""
 
 from sampling.renderers import Renderer, Samples
+from sampling.rendering import Result, Watch, render
 from sampling.sampler import Report, Request, Sampler, Settings, rounds
 
-__all__ = ["Renderer", "Report", "Request", "Sampler", "Samples", "Settings", "rounds"]
+__all__ = [
+    "Renderer",
+    "Report",
+    "Request",
+    "Result",
+    "Sampler",
+    "Samples",
+    "Settings",
+    "Watch",
+    "render",
+    "rounds",
+]

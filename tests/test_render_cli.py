@@ -17,7 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 from benchmarks.places import ROOT
-from sampling import Samples, cli
+from sampling import Samples, rendering
 from sampling.cli import main
 from sampling.renderers.llvm import LLVMError, find_llvm
 from sampling.renderers.mitsuba import MitsubaRenderer, SceneError, load_mitsuba
@@ -37,9 +37,9 @@ PILOT = 16 * 12 * 8
 # A run that looks at the clock, and writes a checkpoint, every 300 samples.
 SLOW = """
 import sys
-from sampling import cli
-cli.CHECKPOINT_SECONDS = 0.0
-cli.FIRST_PART = cli.SMALLEST_PART = cli.LARGEST_PART = 300
+from sampling import cli, rendering
+rendering.CHECKPOINT_SECONDS = 0.0
+rendering.FIRST_PART = rendering.SMALLEST_PART = rendering.LARGEST_PART = 300
 sys.exit(cli.main())
 """
 
@@ -146,7 +146,7 @@ def test_the_same_command_gives_the_same_image_in_parts_of_any_size(
     whole: tuple[list[str], Path], tmp_path: Path, part: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("FIRST_PART", "SMALLEST_PART", "LARGEST_PART"):
-        monkeypatch.setattr(cli, name, part)
+        monkeypatch.setattr(rendering, name, part)
     arguments, output = whole
     assert main([*arguments, "--output", str(tmp_path / "again.exr")]) == 0
     same_image(tmp_path / "again.exr", output)
@@ -188,7 +188,7 @@ def test_ctrl_c_ends_the_round_and_says_how_to_go_on(
     with monkeypatch.context() as patch:
         patch.setattr(MitsubaRenderer, "sample", interrupted)
         for name in ("FIRST_PART", "SMALLEST_PART", "LARGEST_PART"):
-            patch.setattr(cli, name, 200)
+            patch.setattr(rendering, name, 200)
         json_path = tmp_path / "out.json"
         assert main([*arguments, "--output", str(output), "--json", str(json_path)]) == 130
     told = figures(json_path)
@@ -220,7 +220,7 @@ def test_ctrl_c_while_the_picture_is_written_loses_nothing(
         signal.raise_signal(signal.SIGINT)
         write_channels(*picture)
 
-    monkeypatch.setattr(cli, "write_channels", interrupted)
+    monkeypatch.setattr(rendering, "write_channels", interrupted)
     assert main([*arguments, "--output", str(output), "--checkpoint", str(kept)]) == 0
     same_image(output, wanted)
     assert kept.is_file()

@@ -6,13 +6,15 @@ number of the sample and the seed. The film and the scene's sampler are left out
 independent, as the statistics take them to be.
 """
 
+import contextlib
 import functools
 import hashlib
 import importlib
 import os
 import re
+import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +51,11 @@ class MitsubaRenderer:
     Parameters
     ----------
     scene
-        The XML file.
+        An XML file, a dict as `mi.load_dict` takes it, or an `mi.Scene`.
     parameters
-        Values for the scene's own parameters, ``<default name="..."/>``.
+        Values for the own parameters of a scene in a file, ``<default name="..."/>``.
+    sensor
+        Its number, from 0 on, or its id.
     seed
         0 to 2^32 - 1; other seeds give independent images.
     aov
@@ -60,21 +64,27 @@ class MitsubaRenderer:
     filter
         One of `FILTERS`: the film's own, or another of Mitsuba's by name, as it is by default.
     variant
-        One of `VARIANTS`, or "auto": a GPU where there is one, else compiled code where there is an
-        LLVM, else the interpreted variant, with a warning.
+        One of `VARIANTS`, or "auto": that of an `mi.Scene`, for a dict the one that is set; else a
+        GPU where there is one, else compiled code where there is an LLVM, else the interpreted
+        variant, with a warning.
     batch
         Samples in one call of the compiled variants; changes memory and speed, and no bit.
 
     Attributes
     ----------
+    name
+        The file's name, or "the scene".
     variant, version
         The variant in use, and the version of Mitsuba.
+    sensor, sensors
+        Number and id of the sensor, and how many the scene has.
     size
         Height and width of the image, in pixels: the film's crop.
     pixel_filter
         The filter; its ``rays`` says how many each sample takes.
     fingerprint
-        A hash of the scene's file, of every file that it names, and of the parameters.
+        A hash of the scene's file, of every file that it names, and of the parameters; empty
+        of a scene that is not in a file.
     aov_sums
         (8, H W), float64: sums of albedo R, G, B, normal X, Y, Z and depth, and how many samples
         they are of; None without ``aov``. A continued run begins with those of the run before.
@@ -86,13 +96,16 @@ class MitsubaRenderer:
         rendered.
     LLVMError
         If DRJIT_LIBLLVM_PATH names a library that cannot be used.
+    ValueError
+        If the seed or the filter is none.
     """
 
     def __init__(
         self,
-        scene: str | os.PathLike[str],
+        scene: Any,
         parameters: Mapping[str, str] | None = None,
         *,
+        sensor: int | str = 0,
         seed: int = 0,
         aov: bool = False,
         filter: str = SCENE,  # noqa: A002  # what --filter is called
@@ -103,32 +116,28 @@ class MitsubaRenderer:
             raise ValueError(f"expected a seed from 0 to {2**32 - 1}, got {seed}")
         if filter not in FILTERS:
             raise ValueError(f"expected a filter among {', '.join(FILTERS)}, got {filter!r}")
-        self.path = Path(scene)
-        if not self.path.is_file():
-            what = "a folder or a device" if self.path.exists() else "no such file"
-            raise SceneError(f"{self.path}: expected a scene of Mitsuba (XML), got {what}")
-        self._mi = load_mitsuba(variant)
+        self.seed, self.filter, self._batch = seed, filter, batch
+        self.parameters = dict(parameters or {})
+        self.name, self.fingerprint = "the scene", ""
+        if isinstance(scene, str | os.PathLike):
+            self._load_file(Path(scene), variant)
+        else:
+            self._take(scene, variant)
         self.variant: str = self._mi.variant()
         self.version: str = self._mi.__version__
-        self.seed, self._batch = seed, batch
-        self.parameters = dict(parameters or {})
-        state = self._parse()
-        self._scene = self._instantiate(state)
-        self._sensor = self._scene.sensors()[0]
-        width, height = (int(side) for side in self._sensor.film().crop_size())
+        self._sensor = self._chosen_sensor(sensor)
+        film = self._sensor.film()
+        width, height = (int(side) for side in film.crop_size())
         if width * height == 0:
             raise SceneError(
-                f"{self.path}: expected a film of at least one pixel, got {width} x {height}"
+                f"{self.name}: expected a film of at least one pixel, got {width} x {height}"
             )
         if width * height >= 2**31:
             raise SceneError(
-                f"{self.path}: expected fewer than 2^31 pixels, got {width} x {height}"
+                f"{self.name}: expected fewer than 2^31 pixels, got {width} x {height}"
             )
         self.size = height, width
         self._integrator = self._sampling_integrator()
-        self._named = _integrator_names(self._mi, state)
-        film = self._sensor.film()
-        self.filter = filter
         self.pixel_filter = PixelFilter(
             self._mi,
             importlib.import_module("drjit"),
@@ -163,7 +172,7 @@ class MitsubaRenderer:
             try:
                 radiance[part], aovs = draw(which[part], number[part])
             except RuntimeError as error:
-                raise SceneError(f"{self.path}: {_one_line(error)}") from error
+                raise SceneError(f"{self.name}: {_one_line(error)}") from error
             if self.aov_sums is not None:
                 for sums, plane in zip(self.aov_sums, [*aovs, None], strict=True):
                     sums += np.bincount(which[part], plane, len(sums))
@@ -229,28 +238,94 @@ class MitsubaRenderer:
         wanted = aovs[self._aov_at :] if self.aov_sums is not None else []
         return weight * light * place.weight, [plane * place.weight for plane in wanted]
 
-    def _parse(self) -> Any:
+    def _load_file(self, path: Path, variant: str) -> None:
+        """Load a scene from its file."""
+        self.name = str(path)
+        if not path.is_file():
+            what = "a folder or a device" if path.exists() else "no such file"
+            raise SceneError(f"{path}: expected a scene of Mitsuba (XML), got {what}")
+        self._mi = load_mitsuba(variant)
+        state = self._parse(path)
+        self._scene = self._instantiate(path, state)
+        self._named = _integrator_names(self._mi, state)
+
+    def _take(self, scene: Any, variant: str) -> None:
+        """Load a scene from a dict, or take it as it is."""
+        if self.parameters:
+            raise SceneError(
+                "expected parameters with a scene in a file alone; "
+                "put their values into the dict, or set them with mi.traverse"
+            )
+        loaded = None if isinstance(scene, Mapping) else getattr(scene, "variant_name", None)
+        if isinstance(scene, Mapping):
+            # What is in the dict may be of the variant that is set.
+            mi = sys.modules.get("mitsuba")
+            before = mi.variant() if mi is not None else None
+            variant = before if variant == "auto" and before in VARIANTS else variant
+        elif loaded is None or scene.class_name() != "Scene":
+            kind = type(scene).__name__ if loaded is None else scene.class_name()
+            raise SceneError(f"expected a scene: a path, a dict or an mi.Scene, got {kind}")
+        else:
+            if variant not in ("auto", loaded()):
+                raise SceneError(f"expected the variant of the scene, {loaded()}, got {variant}")
+            variant = loaded()
+            if variant not in VARIANTS:
+                raise SceneError(
+                    f"expected a scene of a variant among {', '.join(VARIANTS)}, got {variant}; "
+                    "set one of them before it is loaded"
+                )
+        self._mi = load_mitsuba(variant)
+        if loaded is None:
+            try:
+                scene = self._mi.load_dict(dict(scene))
+            except RuntimeError as error:
+                raise SceneError(f"{self.name}: {_one_line(error)}") from error
+            if not isinstance(scene, self._mi.Scene):
+                raise SceneError(
+                    f'{self.name}: expected a dict with "type": "scene", got one of a '
+                    f"{scene.class_name()}"
+                )
+        self._scene = scene
+        self._named = _innermost(str(scene.integrator()))
+
+    def _chosen_sensor(self, wanted: int | str) -> Any:
+        """Return the sensor of a number or an id."""
+        sensors = self._scene.sensors()
+        self.sensors = len(sensors)
+        if not sensors:
+            raise SceneError(
+                f"{self.name}: expected a sensor, got none; add a <sensor> to the scene"
+            )
+        named = [sensor.id() for sensor in sensors]
+        if isinstance(wanted, str) and wanted and wanted in named:
+            wanted = named.index(wanted)
+        if not isinstance(wanted, int) or not 0 <= wanted < len(sensors):
+            ids = ", ".join(name for name in named if name)
+            raise SceneError(
+                f"{self.name}: expected a sensor from 0 to {len(sensors) - 1}"
+                f"{f', or {ids}' if ids else ''}, got {wanted!r}"
+            )
+        self.sensor: tuple[int, str] = wanted, named[wanted]
+        return sensors[wanted]
+
+    def _parse(self, path: Path) -> Any:
         """Read the file and what it includes, and hash all of it."""
         mi, parser = self._mi, self._mi.parser
         for name in ("config", "filename"):
             if name in self.parameters:
                 raise SceneError(
-                    f"{self.path}: Mitsuba cannot be given a parameter named {name!r}; "
+                    f"{path}: Mitsuba cannot be given a parameter named {name!r}; "
                     "call it otherwise in the scene"
                 )
-        config = parser.ParserConfig(self.variant)
+        config = parser.ParserConfig(self._mi.variant())
         try:
-            state = parser.parse_file(config, os.fspath(self.path), **self.parameters)
+            state = parser.parse_file(config, os.fspath(path), **self.parameters)
             included = list(state.files)
             parser.transform_all(config, state)
         except RuntimeError as error:
-            raise SceneError(f"{self.path}: {_one_line(error)}") from error
+            raise SceneError(f"{path}: {_one_line(error)}") from error
         if state.root.type != mi.ObjectType.Scene:
-            raise SceneError(f"{self.path}: expected a <scene> as the outermost element")
-        if not any(node.type == mi.ObjectType.Sensor for node in state.nodes):
-            raise SceneError(
-                f"{self.path}: expected a sensor, got none; add a <sensor> to the scene"
-            )
+            raise SceneError(f"{path}: expected a <scene> as the outermost element")
         named = sorted(
             {
                 str(value)
@@ -259,7 +334,7 @@ class MitsubaRenderer:
                 if isinstance(value, str)
             }
         )
-        found = [self.path.parent / name for name in named if name]
+        found = [path.parent / name for name in named if name]
         digest = hashlib.sha256()
         for name, value in sorted(self.parameters.items()):
             digest.update(f"{name}={value}\n".encode())
@@ -271,18 +346,18 @@ class MitsubaRenderer:
         self.fingerprint = digest.hexdigest()
         return state
 
-    def _instantiate(self, state: Any) -> Any:
+    def _instantiate(self, path: Path, state: Any) -> Any:
         """Build the scene; files that it names are looked for in its own folder first."""
         mi = self._mi
-        config = mi.parser.ParserConfig(self.variant)
+        config = mi.parser.ParserConfig(mi.variant())
         resolver = mi.FileResolver(mi.file_resolver())
-        resolver.prepend(os.fspath(self.path.resolve().parent))
+        resolver.prepend(os.fspath(path.resolve().parent))
         before = mi.file_resolver()
         mi.set_file_resolver(resolver)
         try:
             return mi.parser.instantiate(config, state)
         except RuntimeError as error:
-            raise SceneError(f"{self.path}: {_one_line(error)}") from error
+            raise SceneError(f"{path}: {_one_line(error)}") from error
         finally:
             mi.set_file_resolver(before)
 
@@ -292,13 +367,13 @@ class MitsubaRenderer:
         integrator = self._scene.integrator()
         if integrator is None:
             raise SceneError(
-                f'{self.path}: expected an integrator, got none; add <integrator type="path"/>'
+                f'{self.name}: expected an integrator, got none; add <integrator type="path"/>'
             )
         # Those in Python are sampled in another way, and their base is not always loaded.
         names = {kind.__name__ for kind in type(integrator).__mro__}
         if not isinstance(integrator, mi.SamplingIntegrator) or "ADIntegrator" in names:
             raise SceneError(
-                f"{self.path}: expected an integrator that samples single rays, such as path, "
+                f"{self.name}: expected an integrator that samples single rays, such as path, "
                 f"volpath or direct, got {integrator.class_name()}"
             )
         return integrator
@@ -316,6 +391,8 @@ class MitsubaRenderer:
     def plan(self) -> dict[str, Any]:
         """Return what is simulated and why, for the JSON."""
         return _plan(self._mi, self._scene, self._sensor, self._named) | {
+            "sensor": f"number {self.sensor[0]} of {self.sensors}"
+            + (f", {self.sensor[1]}" if self.sensor[1] else ""),
             "pixel_filter": self.pixel_filter.name,
             "pixel_filter_why": (
                 f"{'the film has' if self.filter == SCENE else 'asked for:'} "
@@ -375,6 +452,29 @@ def load_mitsuba(variant: str = "auto") -> Any:
     mi.set_log_level(mi.LogLevel.Error)
     _register_materials(variant)
     return mi
+
+
+@contextlib.contextmanager
+def preserved() -> Iterator[None]:
+    """Leave Mitsuba's variant and log level, and Dr.Jit's threads, as they were found.
+
+    Where Mitsuba was not imported yet it has a variant afterwards, for it cannot be left without.
+    """
+    mi, dr = sys.modules.get("mitsuba"), sys.modules.get("drjit")
+    found = None
+    if mi is not None and dr is not None:
+        found = mi.variant(), mi.log_level(), dr.thread_count()
+    try:
+        yield
+    finally:
+        mi, dr = sys.modules.get("mitsuba"), sys.modules.get("drjit")
+        if mi is not None and dr is not None:
+            variant, level, threads = found or (None, mi.LogLevel.Warn, dr.thread_count())
+            mi.set_log_level(level)
+            if variant is not None:
+                mi.set_variant(variant)
+            if dr.thread_count() != threads:
+                dr.set_thread_count(threads)
 
 
 @functools.cache
@@ -448,9 +548,20 @@ def _integrator_names(mi: Any, state: Any) -> tuple[str, int | None]:
     Of nested ones (aov, moment) the innermost.
     """
     found = _nodes(mi, state, "Integrator")
+    if not found:
+        return "", None
     inner = [node for node in found if not list(node.references())] or found
     depth = int(inner[-1].get("max_depth", -1))
     return inner[-1].plugin_name(), depth if depth >= 0 else None
+
+
+def _innermost(words: str) -> tuple[str, int | None]:
+    """Return the same of an integrator that is loaded, from what Mitsuba says of it."""
+    names = re.findall(r"(\w+?)(?:Integrator)?\[\s", words)
+    depths = [int(depth) for depth in re.findall(r"max_depth = (\d+)", words)]
+    # Without a limit it is the largest number of 32 bits.
+    depth = depths[-1] if depths and depths[-1] < 2**31 else None
+    return (names[-1].lower() if names else words), depth
 
 
 def _plan(mi: Any, scene: Any, sensor: Any, integrator: tuple[str, int | None]) -> dict[str, Any]:
@@ -508,7 +619,6 @@ def _plan(mi: Any, scene: Any, sensor: Any, integrator: tuple[str, int | None]) 
     return {
         "integrator": name,
         "max_depth": depth,
-        "sensor": f"the first of {len(scene.sensors())}",
         "effects": [
             {"effect": effect, "simulated": simulated, "why": why}
             for effect, simulated, why in effects
