@@ -1,5 +1,6 @@
 """Adaptive rendering: samples go where their error would be seen (Section 3 of the paper)."""
 
+from sampling.plugin import register_integrator
 from sampling.renderers import Renderer, Samples
 from sampling.rendering import Result, Watch, render
 from sampling.sampler import Report, Request, Sampler, Settings, rounds
@@ -13,6 +14,7 @@ __all__ = [
     "Samples",
     "Settings",
     "Watch",
+    "register_integrator",
     "render",
     "rounds",
 ]

@@ -81,7 +81,8 @@ class Result:
     variance: Plane
     """(H, W, 3), the estimated variance of ``image``."""
     aovs: dict[str, Plane]
-    """(H, W) each, by name of channel: albedo, shading normal and depth, where they were asked."""
+    """(H, W) each, by name of channel: alpha (A) where the scene's film has it, and albedo, shading
+    normal and depth where they were asked."""
     report: Report | None
     """What the last decision saw; None where the run ended before the first."""
     stop_reason: str
@@ -98,9 +99,9 @@ class Result:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an OpenEXR file of 32-bit floats, whole or not at all.
 
-        Its channels: R, G, B; samples; jnd; variance.R, .G, .B; albedo.R, .G, .B, normal.X, .Y, .Z
-        and depth.Z where they were asked. Its header names the reconstruction filter, as
-        ``pixelFilter``.
+        Its channels: R, G, B, and A where the scene's film has it; samples; jnd; variance.R, .G,
+        .B; albedo.R, .G, .B, normal.X, .Y, .Z and depth.Z where they were asked. Its header names
+        the reconstruction filter, as ``pixelFilter``.
 
         Raises
         ------
@@ -141,7 +142,7 @@ def render(
     tolerance: float = 1.0,
     ppd: float = 60.0,
     white: float = 100.0,
-    sensor: int | str = 0,
+    sensor: Any = 0,
     seed: int = 0,
     filter: str = SCENE,  # noqa: A002  # what --filter is called
     *,
@@ -152,7 +153,8 @@ def render(
     time_limit: float | None = None,
     noise_threshold: float | None = None,
     unbiased: bool = False,
-    aov: bool = False,
+    aov: bool | str = False,
+    integrator: Any = None,
     parameters: dict[str, str] | None = None,
     variant: str = "auto",
     checkpoint: str | os.PathLike[str] | None = None,
@@ -175,7 +177,7 @@ def render(
     white
         Luminance of 1.0 in the picture, in cd/m2, over 0.
     sensor
-        Number, from 0 on, or id.
+        Number, from 0 on, or id, or an `mi.Sensor`.
     seed
         0 to 2^32 - 1; other seeds give independent images.
     filter
@@ -190,7 +192,10 @@ def render(
     time_limit
         Seconds, scene and all; the first round is always completed. None: no limit.
     aov
-        Whether to average albedo, shading normal and depth from the same rays.
+        Whether to average albedo, shading normal and depth from the same rays; "own": what the
+        integrator gives by itself.
+    integrator
+        An `mi.Integrator` to render with in place of the scene's own; there is no checkpoint then.
     parameters, variant
         See `MitsubaRenderer`.
     checkpoint
@@ -235,6 +240,7 @@ def render(
             sensor=sensor,
             seed=seed,
             aov=aov,
+            integrator=integrator,
             filter=filter,
             variant=variant,
         )

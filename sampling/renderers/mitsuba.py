@@ -36,9 +36,12 @@ BATCH = 2**20
 # Of Dr.Jit's pool: with one thread, loading a bitmap never ends. Status: measured, Mitsuba 3.9.1.
 FEWEST_THREADS = 2
 
-# What is asked of the `aov` integrator, in its own words, and how many numbers it gives.
+# What is asked of the `aov` integrator, in its own words, and what its numbers are called.
 AOVS = "albedo:albedo,normal:sh_normal,depth:depth"
 AOV_NAMES = ("albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal.Z", "depth.Z")
+
+# What the share of rays that hit something is called; what stands for the integrator's own AOVs.
+ALPHA, OWN = "A", "own"
 
 
 class SceneError(ValueError):
@@ -55,12 +58,15 @@ class MitsubaRenderer:
     parameters
         Values for the own parameters of a scene in a file, ``<default name="..."/>``.
     sensor
-        Its number, from 0 on, or its id.
+        Its number, from 0 on, its id, or an `mi.Sensor`.
     seed
         0 to 2^32 - 1; other seeds give independent images.
     aov
         Whether albedo, shading normal and depth are averaged in the same pass; depth is the length
-        of the ray, in the scene's units, and 0 where it hits nothing.
+        of the ray, in the scene's units, and 0 where it hits nothing. `OWN`: what the integrator
+        gives by itself.
+    integrator
+        One to render with in place of the scene's own; None: its own.
     filter
         One of `FILTERS`: the film's own, or another of Mitsuba's by name, as it is by default.
     variant
@@ -85,9 +91,11 @@ class MitsubaRenderer:
     fingerprint
         A hash of the scene's file, of every file that it names, and of the parameters; empty
         of a scene that is not in a file.
+    planes
+        What is averaged beside the light: alpha where the film has it, then the AOVs.
     aov_sums
-        (8, H W), float64: sums of albedo R, G, B, normal X, Y, Z and depth, and how many samples
-        they are of; None without ``aov``. A continued run begins with those of the run before.
+        (P + 1, H W), float64: sums of the P ``planes``, and how many samples they are of; None
+        where there are none. A continued run begins with those of the run before.
 
     Raises
     ------
@@ -105,9 +113,10 @@ class MitsubaRenderer:
         scene: Any,
         parameters: Mapping[str, str] | None = None,
         *,
-        sensor: int | str = 0,
+        sensor: Any = 0,
         seed: int = 0,
-        aov: bool = False,
+        aov: bool | str = False,
+        integrator: Any = None,
         filter: str = SCENE,  # noqa: A002  # what --filter is called
         variant: str = "auto",
         batch: int = BATCH,
@@ -119,6 +128,7 @@ class MitsubaRenderer:
         self.seed, self.filter, self._batch = seed, filter, batch
         self.parameters = dict(parameters or {})
         self.name, self.fingerprint = "the scene", ""
+        self.sensor: tuple[int | None, str]
         if isinstance(scene, str | os.PathLike):
             self._load_file(Path(scene), variant)
         else:
@@ -137,21 +147,31 @@ class MitsubaRenderer:
                 f"{self.name}: expected fewer than 2^31 pixels, got {width} x {height}"
             )
         self.size = height, width
-        self._integrator = self._sampling_integrator()
+        self._integrator = self._sampling_integrator(integrator)
+        if integrator is not None or self.sensor[0] is None:
+            self.fingerprint = ""  # not all of it is in the file
         self.pixel_filter = PixelFilter(
             self._mi,
             importlib.import_module("drjit"),
             film,
             film.rfilter() if filter == SCENE else self._mi.load_dict({"type": filter}),
         )
-        self._aov_at = 0
-        self.aov_sums: NDArray[np.float64] | None = None
-        if aov:
+        self._alpha: bool = film.flags() & int(self._mi.FilmFlags.Alpha) != 0
+        self.planes = [ALPHA] if self._alpha else []
+        own = self._integrator.aov_names()
+        # In what the integrator gives: where what is wanted begins.
+        self._aov_at = 0 if aov == OWN else len(own)
+        if aov == OWN:
+            self.planes += own
+        elif aov:
             self._integrator = self._mi.load_dict(
                 {"type": "aov", "aovs": AOVS, "image": self._integrator}
             )
             self._aov_at = len(self._integrator.aov_names()) - len(AOV_NAMES)
-            self.aov_sums = np.zeros((len(AOV_NAMES) + 1, width * height))
+            self.planes += AOV_NAMES
+        self.aov_sums: NDArray[np.float64] | None = (
+            np.zeros((len(self.planes) + 1, width * height)) if self.planes else None
+        )
 
     def sample(
         self, pixels: NDArray[np.int64], first: NDArray[np.int64], count: NDArray[np.int64]
@@ -210,7 +230,7 @@ class MitsubaRenderer:
         sampler = mi.load_dict({"type": "independent"})
         width = self.size[1]
         radiance = np.zeros((len(pixels), 3), np.float32)
-        aovs = np.zeros((len(pixels), len(AOV_NAMES) if self.aov_sums is not None else 0))
+        aovs = np.zeros((len(pixels), len(self.planes)))
         for i, (pixel, number) in enumerate(zip(pixels.tolist(), numbers.tolist(), strict=True)):
             high, low = mi.sample_tea_32(pixel, self.seed)
             for negative in (False, True)[: self.pixel_filter.rays]:
@@ -222,7 +242,7 @@ class MitsubaRenderer:
 
     def _follow(self, sampler: Any, x: Any, y: Any, negative: Any) -> tuple[Any, list[Any]]:
         """Return the light along a random ray for each pixel, and its AOVs, both weighted."""
-        mi, sensor = self._mi, self._sensor
+        mi, dr, sensor = self._mi, importlib.import_module("drjit"), self._sensor
         height, width = self.size
         place = self.pixel_filter.place(sampler, x, y, negative)
         position = mi.Point2f(place.x * (1.0 / width), place.y * (1.0 / height))
@@ -232,11 +252,12 @@ class MitsubaRenderer:
             time += sampler.next_1d() * sensor.shutter_open_time()
         # No wavelength is sampled: the variants are RGB.
         ray, weight = sensor.sample_ray_differential(time, 0.5, position, lens)
-        light, _, aovs = self._integrator.sample(
+        light, valid, aovs = self._integrator.sample(
             self._scene, sampler, ray, sensor.get_medium(), True
         )
-        wanted = aovs[self._aov_at :] if self.aov_sums is not None else []
-        return weight * light * place.weight, [plane * place.weight for plane in wanted]
+        planes = [mi.Float(dr.select(valid, 1.0, 0.0))] if self._alpha else []
+        planes += aovs[self._aov_at :]
+        return weight * light * place.weight, [plane * place.weight for plane in planes]
 
     def _load_file(self, path: Path, variant: str) -> None:
         """Load a scene from its file."""
@@ -288,10 +309,13 @@ class MitsubaRenderer:
         self._scene = scene
         self._named = _innermost(str(scene.integrator()))
 
-    def _chosen_sensor(self, wanted: int | str) -> Any:
+    def _chosen_sensor(self, wanted: Any) -> Any:
         """Return the sensor of a number or an id."""
         sensors = self._scene.sensors()
         self.sensors = len(sensors)
+        if isinstance(wanted, self._mi.Sensor):
+            self.sensor = sensors.index(wanted) if wanted in sensors else None, wanted.id()
+            return wanted
         if not sensors:
             raise SceneError(
                 f"{self.name}: expected a sensor, got none; add a <sensor> to the scene"
@@ -305,7 +329,7 @@ class MitsubaRenderer:
                 f"{self.name}: expected a sensor from 0 to {len(sensors) - 1}"
                 f"{f', or {ids}' if ids else ''}, got {wanted!r}"
             )
-        self.sensor: tuple[int, str] = wanted, named[wanted]
+        self.sensor = wanted, named[wanted]
         return sensors[wanted]
 
     def _parse(self, path: Path) -> Any:
@@ -361,10 +385,12 @@ class MitsubaRenderer:
         finally:
             mi.set_file_resolver(before)
 
-    def _sampling_integrator(self) -> Any:
-        """Return the scene's integrator, if light can be asked of it ray by ray."""
+    def _sampling_integrator(self, other: Any) -> Any:
+        """Return the scene's integrator, or another, if light can be asked of it ray by ray."""
         mi = self._mi
-        integrator = self._scene.integrator()
+        integrator = other or self._scene.integrator()
+        if other is not None:
+            self._named = _innermost(str(other))
         if integrator is None:
             raise SceneError(
                 f'{self.name}: expected an integrator, got none; add <integrator type="path"/>'
@@ -379,19 +405,23 @@ class MitsubaRenderer:
         return integrator
 
     def aovs(self) -> dict[str, NDArray[np.float64]]:
-        """Return the means of `AOV_NAMES` so far, (H, W) each, by name of channel."""
+        """Return the means of ``planes`` so far, (H, W) each, by name of channel."""
         if self.aov_sums is None:
             return {}
         *sums, count = self.aov_sums
         return {
             name: (plane / np.maximum(count, 1.0)).reshape(self.size)
-            for name, plane in zip(AOV_NAMES, sums, strict=True)
+            for name, plane in zip(self.planes, sums, strict=True)
         }
 
     def plan(self) -> dict[str, Any]:
         """Return what is simulated and why, for the JSON."""
         return _plan(self._mi, self._scene, self._sensor, self._named) | {
-            "sensor": f"number {self.sensor[0]} of {self.sensors}"
+            "sensor": (
+                f"number {self.sensor[0]} of {self.sensors}"
+                if self.sensor[0] is not None
+                else "none of the scene's own"
+            )
             + (f", {self.sensor[1]}" if self.sensor[1] else ""),
             "pixel_filter": self.pixel_filter.name,
             "pixel_filter_why": (
