@@ -323,6 +323,11 @@ def _text(figures: dict[str, Any], options: argparse.Namespace) -> str:
             f"black: {figures['pixels_empty']} pixels that have no finite sample; "
             "nothing can be said of them"
         )
+    if figures["black"]:
+        lines.append(
+            "black: no sample has met any light; look at the scene's lights and at what its "
+            "sensor sees"
+        )
     plan = figures["plan"]
     depth = "no limit of depth" if plan["max_depth"] is None else f"depth {plan['max_depth']}"
     simulated = [each["effect"] for each in plan["effects"] if each["simulated"]]

@@ -279,6 +279,14 @@ def render(
         return run.result(reason, effects)
 
 
+class _EndedError(Exception):
+    """A decision is not waited for; the run ends."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
 @dataclass
 class _Run:
     """A scene, its sampler, and what the run has cost, over all its interruptions."""
@@ -339,10 +347,27 @@ class _Run:
         saved = time.monotonic()
         at_once = FIRST_PART
         drawn, drawing = 0, 0.0
+
+        def ended() -> str | None:
+            """Return why no more is to be done at all."""
+            if watch.presses() > 1:
+                return "interrupted"
+            # The first round is always completed: without it there is no image, and no prediction.
+            late = time.monotonic() - self.begun > time_limit
+            return "time_limit" if late and sampler.report() is not None else None
+
+        def look() -> None:
+            if (reason := ended()) is not None:
+                raise _EndedError(reason)
+
         while True:
             start = time.perf_counter()
-            request = sampler.ask()
-            seconds["metric"] += time.perf_counter() - start
+            try:
+                request = sampler.ask(look)
+            except _EndedError as ending:
+                return ending.reason
+            finally:
+                seconds["metric"] += time.perf_counter() - start
             report = sampler.report()
             watch.round(report)
             if request is None:
@@ -368,11 +393,8 @@ class _Run:
                     except checkpoints.CheckpointError as error:  # a full disk: no reason to stop
                         warnings.warn(str(error), stacklevel=3)
                     saved = time.monotonic()
-                if watch.presses() > 1:
-                    return "interrupted"
-                # The pilot is always completed: without it there is no image.
-                if time.monotonic() - self.begun > time_limit and report is not None:
-                    return "time_limit"
+                if (reason := ended()) is not None:
+                    return reason
             speed = drawn / drawing
             at_once = int(np.clip(PART_SECONDS * speed, SMALLEST_PART, LARGEST_PART))
 
@@ -405,6 +427,7 @@ class _Run:
             "samples_max": int(sampler.count.max()),
             "nonfinite": report.nonfinite if report is not None else 0,
             "pixels_empty": empty,
+            "black": not sampler.image.any(),
             "unbiased": identity["unbiased"],
             "width": width,
             "height": height,

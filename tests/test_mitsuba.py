@@ -286,6 +286,18 @@ def test_the_fingerprint_is_of_everything_that_is_named(mitsuba: Any, tmp_path: 
             '<scene version="3.0.0">' + SENSOR.replace('"path"', '"prb"') + "</scene>",
             "expected an integrator that samples single rays",
         ),
+        (
+            f'<scene version="3.0.0">{SENSOR}<shape type="sphere"/></scene>',
+            "expected a light, got none",
+        ),
+        (
+            '<scene version="3.0.0"><emitter type="constant"/>'
+            + SENSOR.replace(
+                '"path"/>', '"aov"><string name="aovs" value="dd:depth"/></integrator>'
+            )
+            + "</scene>",
+            "expected an integrator inside that of the type aov, got none",
+        ),
     ],
 )
 def test_scenes_that_are_refused(mitsuba: Any, tmp_path: Path, text: str, words: str) -> None:

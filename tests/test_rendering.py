@@ -4,6 +4,7 @@ import importlib
 import re
 import subprocess
 import sys
+import time
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from benchmarks.places import ROOT
 from sampling import Result, Watch, rendering
 from sampling.checkpoint import CheckpointError
 from sampling.cli import main
+from sampling.prediction import Model
 from sampling.renderers.llvm import LLVMError
 from sampling.renderers.mitsuba import MitsubaRenderer, SceneError, load_mitsuba
 from torch_vdm import Observer
@@ -39,6 +41,12 @@ TWO = """
 </sensor>
 <emitter type="constant"/><shape type="sphere"/></scene>
 """
+DARK: dict[str, Any] = {
+    "type": "scene",
+    "i": {"type": "volpath"},
+    "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+    "ball": {"type": "sphere"},
+}
 
 
 @pytest.fixture(scope="module")
@@ -258,6 +266,44 @@ def test_a_run_that_was_ended_goes_on_from_its_checkpoint(
         same(sampling.render(path, TOLERANCE, resume=tmp_path / "none", **options), whole)
 
 
+def test_the_clock_ends_a_decision(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decide, clock, now = Model.simulated, time.monotonic, {"decisions": 0, "late": 0.0}
+
+    def second_takes_an_hour(model: Model, *options: Any, **named: Any) -> NDArray[np.float64]:
+        now["decisions"] += 1
+        if now["decisions"] == 2:
+            now["late"] = 3600.0
+        return decide(model, *options, **named)
+
+    monkeypatch.setattr(Model, "simulated", second_takes_an_hour)
+    monkeypatch.setattr(time, "monotonic", lambda: clock() + now["late"])
+    result = sampling.render(path, 0.5, parameters=SMALL, time_limit=1800.0)
+    assert (result.stop_reason, result.converged) == ("time_limit", False)
+    assert now["decisions"] == 2
+    # The picture has the samples of the second round; the prediction is that of the first.
+    assert result.report is not None
+    assert result.report.round == 1
+    assert result.samples.sum() > result.report.samples == 16 * 96
+
+
+def test_depth_needs_no_light(mitsuba: Any) -> None:
+    mitsuba.set_variant("llvm_ad_rgb")
+    sensor = DARK["sensor"] | {"to_world": mitsuba.ScalarTransform4f().translate([0, 0, -5])}
+    result = sampling.render({**DARK, "sensor": sensor, "i": {"type": "depth"}}, max_spp=2)
+    assert 4.0 <= result.image.max() < 5.0
+    assert not result.figures["black"]
+
+
+def test_a_black_picture_is_told(
+    two: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    two.write_text(
+        TWO.replace('"constant"/>', '"constant"><rgb name="radiance" value="0,0,0"/></emitter>')
+    )
+    assert main([str(two), "--output", str(tmp_path / "out.exr"), "--max-spp", "4"]) == 0
+    assert "black: no sample has met any light" in capsys.readouterr().out
+
+
 def test_a_line_is_shown_on_a_terminal_alone(
     path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -283,6 +329,13 @@ def test_what_cannot_be_rendered_is_refused_in_one_line(mitsuba: Any, path: Path
         (loaded.sensors()[0], {}, "a path, a dict or an mi.Scene, got Perspective"),
         ({"type": "sphere"}, {}, 'a dict with "type": "scene"'),
         ({"type": "scene", "a": {"type": "velvet"}}, {}, "velvet"),
+        (dict(DARK), {}, "the scene: expected a light, got none"),
+        (mitsuba.load_dict(DARK), {}, "the scene: expected a light, got none"),
+        (
+            {**DARK, "light": {"type": "constant"}, "i": {"type": "aov", "aovs": "d:depth"}},
+            {},
+            "the scene: expected an integrator inside that of the type aov, got none",
+        ),
         (loaded, {"parameters": {"width": "3"}}, "parameters with a scene in a file alone"),
         (loaded, {"variant": "scalar_rgb"}, "the variant of the scene, llvm_ad_rgb, got scalar"),
         (spectral, {}, "a scene of a variant among .*, got scalar_spectral"),

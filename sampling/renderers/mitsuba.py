@@ -44,6 +44,10 @@ AOV_NAMES = ("albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal
 ALPHA, OWN = "A", "own"
 
 
+# How the names of integrators begin whose picture is black where the scene has no light.
+LIT = ("path", "direct", "vol")
+
+
 class SceneError(ValueError):
     """A scene that cannot be rendered; the message is one line."""
 
@@ -401,6 +405,18 @@ class MitsubaRenderer:
             raise SceneError(
                 f"{self.name}: expected an integrator that samples single rays, such as path, "
                 f"volpath or direct, got {integrator.class_name()}"
+            )
+        name = self._named[0]
+        if name == "aov":
+            raise SceneError(
+                f"{self.name}: expected an integrator inside that of the type aov, got none, "
+                'whose picture is black; put <integrator type="path"/> into it'
+            )
+        dark = not self._scene.emitters() and self._scene.environment() is None
+        if dark and name.startswith(LIT):
+            raise SceneError(
+                f"{self.name}: expected a light, got none, and a picture that is black; "
+                "add an <emitter> to the scene"
             )
         return integrator
 
