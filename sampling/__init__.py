@@ -2,6 +2,7 @@
 
 from sampling.plugin import register_integrator
 from sampling.renderers import Renderer, Samples
+from sampling.renderers.llvm import find_llvm
 from sampling.rendering import Result, Watch, render
 from sampling.sampler import Report, Request, Sampler, Settings, rounds
 
@@ -14,6 +15,7 @@ __all__ = [
     "Samples",
     "Settings",
     "Watch",
+    "find_llvm",
     "register_integrator",
     "render",
     "rounds",

@@ -67,7 +67,7 @@ class Watch:
         return 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Result:
     """A rendered picture, and what is known of it."""
 
@@ -93,7 +93,7 @@ class Result:
     """What ``vdm-render --json`` says, but for what concerns its command."""
     header: dict[str, str]
     """What the file says of itself beside its channels."""
-    run: "_Run" = field(repr=False)
+    _run: "_Run" = field(repr=False)
     """What a checkpoint is made of."""
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -134,7 +134,7 @@ class Result:
         CheckpointError
             If it cannot be written, or the scene is not in a file.
         """
-        self.run.save(Path(path))
+        self._run.save(Path(path))
 
 
 def render(
@@ -451,7 +451,7 @@ class _Run:
                 "software": f"vdm-render {__version__}",
                 "pixelFilter": renderer.pixel_filter.words,
             },
-            run=self,
+            _run=self,
         )
 
     def _total(self) -> float:

@@ -2,6 +2,8 @@
 
 import importlib
 import re
+import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 
 import sampling
 from benchmarks.places import ROOT
-from sampling import Result, Watch, rendering
+from sampling import Result, Samples, Watch, rendering
 from sampling.checkpoint import CheckpointError
 from sampling.cli import main
 from sampling.prediction import Model
@@ -235,6 +237,31 @@ def test_all_sensors_are_rendered_to_files_of_their_own(
         for name, plane in alone.items():
             np.testing.assert_array_equal(plane, together[name])
     assert re.findall(r'"sensor": (.*),\n    "sensors": 2', told.read_text()) == ['"front"', "1"]
+
+
+def test_all_sensors_go_on_where_they_were_interrupted(
+    two: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(two), "--sensor", "all", "--max-spp", "4", "--output"]
+    assert main([*words, str(tmp_path / "whole.exr")]) == 0
+    draw = MitsubaRenderer.sample
+
+    def interrupted(renderer: MitsubaRenderer, *request: Any) -> Samples:
+        if renderer.sensor[0] == 1:
+            for _ in range(2):
+                signal.raise_signal(signal.SIGINT)
+        return draw(renderer, *request)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MitsubaRenderer, "sample", interrupted)
+        assert main([*words, str(tmp_path / "out.exr")]) == 130
+    command = re.search(r"go on with: vdm-render (.*)\n", capsys.readouterr().err)
+    assert command is not None
+    assert main(shlex.split(command.group(1))) == 0
+    for number in (0, 1):
+        ours, wanted = (channels(tmp_path / f"{n}.{number}.exr") for n in ("out", "whole"))
+        for name, plane in wanted.items():
+            np.testing.assert_array_equal(ours[name], plane)
 
 
 def test_a_run_that_was_ended_goes_on_from_its_checkpoint(

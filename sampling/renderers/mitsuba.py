@@ -327,13 +327,13 @@ class MitsubaRenderer:
         named = [sensor.id() for sensor in sensors]
         if isinstance(wanted, str) and wanted and wanted in named:
             wanted = named.index(wanted)
-        if not isinstance(wanted, int) or not 0 <= wanted < len(sensors):
+        if not isinstance(wanted, int | np.integer) or not 0 <= wanted < len(sensors):
             ids = ", ".join(name for name in named if name)
             raise SceneError(
                 f"{self.name}: expected a sensor from 0 to {len(sensors) - 1}"
                 f"{f', or {ids}' if ids else ''}, got {wanted!r}"
             )
-        self.sensor = wanted, named[wanted]
+        self.sensor = int(wanted), named[wanted]
         return sensors[wanted]
 
     def _parse(self, path: Path) -> Any:
@@ -472,7 +472,7 @@ def load_mitsuba(variant: str = "auto") -> Any:
         # Whoever imported Mitsuba before let Dr.Jit choose for itself, once and for all.
         raise SceneError(
             f"expected LLVM {OLDEST} or newer, got {dr.detail.llvm_version()[0]}, which was loaded "
-            f"when mitsuba was imported; load the scene before that, or set {VARIABLE}"
+            f"when mitsuba was imported; call sampling.find_llvm() before that, or set {VARIABLE}"
         )
     usable = {
         "cuda_ad_rgb": bool(dr.has_backend(dr.JitBackend.CUDA)),
