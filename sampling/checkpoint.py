@@ -34,7 +34,10 @@ WORDS = {
     "ppd": "--ppd",
     "white": "--white",
     "observer": "--observer",
+    "observer_numbers": "the observer's numbers",
     "aov": "--aov",
+    "filter": "--filter",
+    "sensor": "--sensor",
 }
 
 

@@ -6,22 +6,18 @@ import json
 import shlex
 import signal
 import sys
-import time
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import numpy as np
-import torch
-
-from sampling import checkpoint
-from sampling.renderers.mitsuba import VARIANTS, MitsubaRenderer
-from sampling.sampler import Report, Sampler, Settings, under
+from sampling.renderers.filter import FILTERS, SCENE
+from sampling.renderers.mitsuba import VARIANTS
+from sampling.rendering import EFFECTS, Result, Watch, render, seen, terminal
+from sampling.sampler import Report
 from sampling.strategies import STRATEGIES
-from torch_vdm import VDM, Display, __version__
+from torch_vdm import __version__
 from torch_vdm.cli import (
     DONE,
     INTERRUPTED,
@@ -37,24 +33,10 @@ from torch_vdm.cli import (
     run,
     tell,
 )
-from torch_vdm.io import atomic_path, write_channels
-from torch_vdm.model.distance import VISIBLE
+from torch_vdm.io import atomic_path
 
-# Seconds between two checkpoints. Status: choice.
-CHECKPOINT_SECONDS = 30.0
-
-# Samples between two looks at the clock: at first, and then as many as take about so long. Neither
-# changes a bit of the image. Status: choice; a call has to be large to be fast.
-FIRST_PART, SMALLEST_PART, LARGEST_PART = 2**16, 2**12, 2**20
-PART_SECONDS = 0.5
-
-# Pixels below which the metric runs on one thread: more would gain little, and where the cores are
-# busy they wait for each other. Status: choice; measured at 96 x 64 on two busy cores, two threads
-# took 10 s for what one does in 0.7 s.
-FEW_PIXELS = 2**18
-
-# Seconds between two changes of the live line.
-LINE_SECONDS = 0.2
+# What --sensor takes for every sensor of the scene.
+ALL = "all"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -108,11 +90,24 @@ def _parser() -> argparse.ArgumentParser:
     )
     view.add_argument("--observer", choices=tuple(OBSERVERS), default="calibrated")
     scene = parser.add_argument_group("scene")
-    scene.add_argument("--effects", choices=("auto", "full"), default="auto")
+    scene.add_argument("--effects", choices=tuple(EFFECTS), default="auto")
     scene.add_argument(
         "--aov",
         action="store_true",
         help="write albedo, shading normal and depth, from the same rays",
+    )
+    scene.add_argument(
+        "--sensor",
+        type=_sensor,
+        default=0,
+        metavar="N|ID|all",
+        help="number from 0 on, or id; all: each, to OUT.0.exr, OUT.1.exr and so on (0)",
+    )
+    scene.add_argument(
+        "--filter",
+        choices=FILTERS,
+        default=SCENE,
+        help="reconstruction filter of the pixels; scene: its film's own (scene)",
     )
     scene.add_argument(
         "--variant", choices=("auto", *VARIANTS), default="auto", help="of Mitsuba (auto)"
@@ -137,234 +132,75 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-@dataclass
-class _Progress:
-    """What a run has cost, over all its interruptions."""
+class _Console(Watch):
+    """Prints a line a round where there is no terminal, and counts Ctrl-C.
 
-    samples: int = 0
-    seconds_render: float = 0.0
-    seconds_metric: float = 0.0
-    seconds_total: float = 0.0
-    begun: float = field(default_factory=time.monotonic)
-    """When this part of the run began."""
-
-    @property
-    def total(self) -> float:
-        """Seconds of the run, those before an interruption included."""
-        return self.seconds_total + time.monotonic() - self.begun
-
-    def state(self) -> dict[str, Any]:
-        """Return what a checkpoint keeps."""
-        return {
-            "progress.samples": self.samples,
-            "progress.seconds_render": self.seconds_render,
-            "progress.seconds_metric": self.seconds_metric,
-            "progress.seconds_total": self.total,
-        }
-
-
-class _Interrupt:
-    """Counts Ctrl-C: the first ends the run after its round, the second at once.
-
-    A request to terminate, as of a cluster's scheduler, ends it at once too. What there is is
-    written whole all the same; a third Ctrl-C gives that up.
+    The first ends the run after its round, the second at once. A request to terminate, as of a
+    cluster's scheduler, ends it at once too. What there is is written whole all the same; a third
+    Ctrl-C gives that up. Before rendering begins, Ctrl-C is what it always is.
     """
 
-    def __init__(self) -> None:
-        self.count = 0
+    def __init__(self, tolerance: float) -> None:
+        self._tolerance = tolerance
+        self._silent: bool = terminal().is_terminal
+        self._told = 0
+        self._count = 0
+        self._before: dict[signal.Signals, Any] = {}
 
-    def __enter__(self) -> "_Interrupt":
-        kinds = signal.SIGINT, signal.SIGTERM
-        self._before = {kind: signal.signal(kind, self._note) for kind in kinds}
+    def __enter__(self) -> "_Console":
         return self
 
     def __exit__(self, *_: object) -> None:
         for kind, handler in self._before.items():
             signal.signal(kind, handler)
 
+    def begin(self) -> None:
+        kinds = signal.SIGINT, signal.SIGTERM
+        self._before = {kind: signal.signal(kind, self._note) for kind in kinds}
+
+    def presses(self) -> int:
+        return self._count
+
+    def round(self, report: Report | None) -> None:
+        # A continued run has told of its rounds before.
+        if report is not None and report.round != self._told and not self._silent:
+            words = [f"round {report.round}", f"{report.spp:.4g} samples per pixel"]
+            words += seen(report, self._tolerance)
+            print(f"vdm-render: {' · '.join(words)}", file=sys.stderr, flush=True)
+            self._told = report.round
+
     def _note(self, number: int, frame: FrameType | None) -> None:
-        self.count = max(2, self.count) if number == signal.SIGTERM else self.count + 1
-        if self.count >= 3:
+        self._count = max(2, self._count) if number == signal.SIGTERM else self._count + 1
+        if self._count >= 3:
             signal.default_int_handler(number, frame)
 
 
-@dataclass
-class _Job:
-    """A scene, its sampler, and what is known of the run so far."""
-
-    options: argparse.Namespace
-    renderer: MitsubaRenderer
-    sampler: Sampler
-    progress: _Progress
-    identity: dict[str, Any]
-
-    def save(self, path: Path) -> None:
-        """Write a checkpoint."""
-        state = {f"sampler.{name}": v for name, v in self.sampler.state().items()}
-        if self.renderer.aov_sums is not None:
-            state["aov_sums"] = self.renderer.aov_sums
-        checkpoint.save(path, checkpoint.Checkpoint(self.identity, state | self.progress.state()))
-
-    def render(self, interrupt: _Interrupt, line: "_Line") -> str:
-        """Render until the sampler, the clock or the user says stop; return the reason."""
-        options, progress, sampler = self.options, self.progress, self.sampler
-        saved = time.monotonic()
-        at_once = FIRST_PART
-        drawn, drawing = 0, 0.0
-        while True:
-            start = time.perf_counter()
-            request = sampler.ask()
-            progress.seconds_metric += time.perf_counter() - start
-            report = sampler.report()
-            line.round(report)
-            if request is None:
-                assert report is not None
-                assert report.stop_reason is not None
-                return report.stop_reason
-            if report is not None and interrupt.count:
-                return "interrupted"
-            for part in request.parts(at_once):
-                start = time.perf_counter()
-                samples = self.renderer.sample(part.pixels, part.first, part.count)
-                middle = time.perf_counter()
-                sampler.tell(samples)
-                end = time.perf_counter()
-                progress.samples += part.samples
-                progress.seconds_render += middle - start
-                progress.seconds_metric += end - middle
-                drawn, drawing = drawn + part.samples, drawing + middle - start
-                line.part(progress.samples, drawn / drawing, interrupt.count > 0)
-                if options.checkpoint and time.monotonic() - saved > CHECKPOINT_SECONDS:
-                    try:
-                        self.save(options.checkpoint)
-                    except checkpoint.CheckpointError as error:  # a full disk: no reason to stop
-                        print(f"vdm-render: warning: {error}", file=sys.stderr)
-                    saved = time.monotonic()
-                if interrupt.count > 1:
-                    return "interrupted"
-                # The pilot is always completed: without it there is no image.
-                late = time.monotonic() - progress.begun > (options.time_limit or np.inf)
-                if late and report is not None:
-                    return "time_limit"
-            speed = drawn / drawing
-            at_once = int(np.clip(PART_SECONDS * speed, SMALLEST_PART, LARGEST_PART))
-
-    def write(self) -> None:
-        """Write the image."""
-        sampler, report = self.sampler, self.sampler.report()
-        planes = dict(zip("RGB", np.moveaxis(sampler.image, -1, 0), strict=True))
-        planes["samples"] = sampler.count
-        planes["jnd"] = report.jnd if report is not None else np.full(sampler.size, np.inf)
-        for name, plane in zip("RGB", np.moveaxis(sampler.variance, -1, 0), strict=True):
-            planes[f"variance.{name}"] = plane
-        planes |= self.renderer.aovs()
-        write_channels(
-            self.options.output,
-            {name: torch.tensor(plane, dtype=torch.float32) for name, plane in planes.items()},
-        )
-
-    def figures(self, reason: str) -> dict[str, Any]:
-        """Return what the JSON says."""
-        options, report, progress = self.options, self.sampler.report(), self.progress
-        height, width = self.renderer.size
-        empty = int((self.sampler.count == 0).sum())
-        return {
-            "strategy": options.strategy,
-            "seed": options.seed,
-            "tolerance": options.tolerance,
-            "rounds": report.round if report is not None else 0,
-            "samples_total": progress.samples,
-            "spp_mean": progress.samples / (height * width),
-            "predicted_max_jnd": report.predicted if report is not None else None,
-            "visible_fraction": (
-                float((report.jnd > VISIBLE).mean()) if report is not None else None
-            ),
-            "over_tolerance_fraction": report.over if report is not None else None,
-            # A pixel without a finite sample is black, and nothing is known of it.
-            "converged": report is not None and report.converged and not empty,
-            "stop_reason": reason,
-            "seconds_render": progress.seconds_render,
-            "seconds_metric": progress.seconds_metric,
-            "seconds_total": progress.total,
-            "variant": self.renderer.variant,
-            "plan": _plan(self.renderer, options),
-            "samples_min": int(self.sampler.count.min()),
-            "samples_max": int(self.sampler.count.max()),
-            "nonfinite": report.nonfinite if report is not None else 0,
-            "pixels_empty": empty,
-            "unbiased": options.unbiased,
-            "width": width,
-            "height": height,
-            "ppd": options.ppd,
-            "white": options.white,
-            "observer": options.observer,
-            "scene": str(options.scene),
-            "version": __version__,
-            "mitsuba": self.renderer.version,
-            "reproduce": _reproduce(options),
-        }
-
-
 def _run(options: argparse.Namespace, words: list[str]) -> int:
-    _check(options)
-    progress = _Progress()
-    settings = Settings(
-        strategy=options.strategy,
-        tolerance=options.tolerance,
-        max_spp=options.max_spp,
-        noise_threshold=options.noise_threshold,
-        unbiased=options.unbiased,
-    )
-    metric = VDM(options.ppd, Display.linear(options.white), OBSERVERS[options.observer]())
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        renderer = MitsubaRenderer(
-            options.scene,
-            dict(options.parameters),
-            seed=options.seed,
-            aov=options.aov,
-            variant=options.variant,
-        )
-    for warning in told:
-        if warning.category is UserWarning:  # the renderer's own, not what libraries deprecate
-            print(f"vdm-render: warning: {warning.message}", file=sys.stderr)
-    # The sampler's own state says which settings it has; the rest is said here.
-    height, width = renderer.size
-    identity = {
-        **asdict(settings),
-        "version": __version__,
-        "mitsuba": renderer.version,
-        "variant": renderer.variant,
-        "size": f"{width} x {height}",
-        "scene": renderer.fingerprint,
-        **{name: getattr(options, name) for name in ("seed", "ppd", "white", "observer")},
-        "aov": options.aov,
-    }
-    kept = options.checkpoint or options.output.with_name(f"{options.output.name}.checkpoint")
-    sampler = _resumed(kept, identity, metric, renderer, progress) if options.resume else None
-    job = _Job(
-        options, renderer, sampler or Sampler(renderer.size, metric, settings), progress, identity
-    )
-    few = height * width < FEW_PIXELS
-    with _threads(1 if few else torch.get_num_threads()), _Interrupt() as interrupt:
-        with _live(options) as line:
-            reason = job.render(interrupt, line)
-        job.write()
-        if options.checkpoint or reason == "interrupted":
-            job.save(kept)
-    figures = job.figures(reason)
-    if options.json == "-":
-        tell(json.dumps(figures, indent=2) + "\n")
-    else:
-        if options.json is not None:
+    every = options.sensor == ALL
+    sensors: list[int | str] = [0 if every else options.sensor]
+    told: list[dict[str, Any]] = []
+    while len(told) < len(sensors):
+        number = len(told)
+        result = _rendered(options, sensors[number], number if every else None)
+        if every:
+            sensors = list(range(result.figures["sensors"]))
+        told.append(result.figures)
+        if result.stop_reason == "interrupted":
+            break
+    if options.json is not None:
+        text = json.dumps(told if every else told[0], indent=2) + "\n"
+        if options.json == "-":
+            tell(text)
+        else:
             with atomic_path(Path(options.json)) as temporary:
-                temporary.write_text(json.dumps(figures, indent=2) + "\n")
-        tell(_text(figures, options))
-    if reason != "interrupted":
+                temporary.write_text(text)
+    if options.json != "-":
+        tell("\n".join(_text(figures, options) for figures in told))
+    if told[-1]["stop_reason"] != "interrupted":
         return DONE
     again = [word for word in words if word != "--resume"]
     if options.checkpoint is None:
-        again += ["--checkpoint", str(kept)]
+        again += ["--checkpoint", str(_kept(options))]
     print(
         f"vdm-render: interrupted; go on with: {shlex.join(['vdm-render', *again, '--resume'])}",
         file=sys.stderr,
@@ -372,63 +208,69 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     return INTERRUPTED
 
 
-@contextlib.contextmanager
-def _threads(count: int) -> Iterator[None]:
-    """Have torch compute on so many threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-def _resumed(
-    path: Path,
-    identity: dict[str, Any],
-    metric: VDM,
-    renderer: MitsubaRenderer,
-    progress: _Progress,
-) -> Sampler | None:
-    """Return the sampler that a checkpoint holds; None, and a word, where there is no file yet."""
-    if not path.exists():
-        # A run that was killed before its first checkpoint begins anew: the same image.
-        print(
-            f"vdm-render: {path}: no checkpoint yet; starting from the beginning", file=sys.stderr
+def _rendered(options: argparse.Namespace, sensor: int | str, number: int | None) -> Result:
+    """Render one view and write what is asked of it; ``number`` of those of all sensors."""
+    output, kept = _numbered(options.output, number), _numbered(_kept(options), number)
+    checkpoint = kept if options.checkpoint else None
+    if output.suffix.lower() != ".exr":
+        raise UsageError(f"{output}: expected a name that ends in .exr")
+    # Before anything is rendered: what could not be written or would destroy an input.
+    check_outputs((options.scene,), (output, checkpoint, json_path(options)))
+    with _warned(), _Console(options.tolerance) as console:
+        result = render(
+            options.scene,
+            options.tolerance,
+            options.ppd,
+            options.white,
+            sensor,
+            options.seed,
+            options.filter,
+            effects=options.effects,
+            observer=OBSERVERS[options.observer](),
+            strategy=options.strategy,
+            max_spp=options.max_spp,
+            time_limit=options.time_limit,
+            noise_threshold=options.noise_threshold,
+            unbiased=options.unbiased,
+            aov=options.aov,
+            parameters=dict(options.parameters),
+            variant=options.variant,
+            checkpoint=checkpoint,
+            resume=kept if options.resume else None,
+            watch=console,
         )
-        return None
-    state = checkpoint.load(path, identity)
-    try:
-        sampler = Sampler.restore(under("sampler.", state), metric)
-        progress.samples = state["progress.samples"]
-        progress.seconds_render = state["progress.seconds_render"]
-        progress.seconds_metric = state["progress.seconds_metric"]
-        progress.seconds_total = state["progress.seconds_total"]
-        if renderer.aov_sums is not None:
-            renderer.aov_sums[:] = state["aov_sums"]
-    except (KeyError, TypeError) as error:
-        raise checkpoint.CheckpointError(
-            f"{path}: expected a whole checkpoint, got one without {error}; "
-            "start anew without --resume"
-        ) from error
-    return sampler
+        result.save(output)
+        if result.stop_reason == "interrupted" and checkpoint is None:
+            result.save_checkpoint(kept)
+    result.figures["scene"] = str(options.scene)
+    result.figures["written"] = [str(path) for path in (output, checkpoint) if path is not None]
+    result.figures["reproduce"] = _reproduce(options)
+    return result
 
 
-def _check(options: argparse.Namespace) -> None:
-    """Refuse, before anything is rendered, what could not be written or would destroy an input."""
-    if options.output.suffix.lower() != ".exr":
-        raise UsageError(f"{options.output}: expected a name that ends in .exr")
-    outputs = (options.output, options.checkpoint, json_path(options))
-    check_outputs((options.scene,), outputs)
+def _kept(options: argparse.Namespace) -> Path:
+    """Return where the run is kept, if it is."""
+    kept: Path = options.checkpoint or options.output.with_name(f"{options.output.name}.checkpoint")
+    return kept
 
 
-def _plan(renderer: MitsubaRenderer, options: argparse.Namespace) -> dict[str, Any]:
-    """Return what is simulated and why."""
-    why = {
-        "auto": "nothing is left out yet: what the scene names is simulated",
-        "full": "asked for: what the scene names is simulated",
-    }[options.effects]
-    return {"effects_option": options.effects, "why": why, **renderer.plan()}
+def _numbered(path: Path, number: int | None) -> Path:
+    """Return the name with a number before its suffix; as it is without one."""
+    return path if number is None else path.with_name(f"{path.stem}.{number}{path.suffix}")
+
+
+@contextlib.contextmanager
+def _warned() -> Iterator[None]:
+    """Print the renderer's warnings as lines of the program, not what libraries deprecate."""
+
+    def line(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+        if category is UserWarning:
+            print(f"vdm-render: warning: {message}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warnings.showwarning = line
+        yield
 
 
 def _reproduce(options: argparse.Namespace) -> str:
@@ -438,7 +280,7 @@ def _reproduce(options: argparse.Namespace) -> str:
         value = getattr(options, name)
         if value is not None:
             words += [f"--{name.replace('_', '-')}", str(value)]
-    for name in ("ppd", "white", "observer", "effects", "variant"):
+    for name in ("ppd", "white", "observer", "effects", "sensor", "filter", "variant"):
         words += [f"--{name}", str(getattr(options, name))]
     words += [f"--{name}" for name in ("unbiased", "aov") if getattr(options, name)]
     for name, value in options.parameters:
@@ -481,105 +323,26 @@ def _text(figures: dict[str, Any], options: argparse.Namespace) -> str:
             f"black: {figures['pixels_empty']} pixels that have no finite sample; "
             "nothing can be said of them"
         )
+    if figures["black"]:
+        lines.append(
+            "black: no sample has met any light; look at the scene's lights and at what its "
+            "sensor sees"
+        )
     plan = figures["plan"]
     depth = "no limit of depth" if plan["max_depth"] is None else f"depth {plan['max_depth']}"
     simulated = [each["effect"] for each in plan["effects"] if each["simulated"]]
+    if figures["sensors"] > 1:
+        lines.append(f"seen by: sensor {plan['sensor']} (--sensor)")
     lines += [
-        f"simulated: {plan['integrator']}, {depth}, {figures['variant']}"
-        + "".join(f", {effect}" for effect in simulated),
+        f"simulated: {plan['integrator']}, {depth}, {figures['variant']}, "
+        f"{plan['pixel_filter']} filter" + "".join(f", {effect}" for effect in simulated),
         f"assumed: {options.ppd:g} pixels per degree (--ppd)",
         f"assumed: 1.0 is {options.white:g} cd/m2 (--white)",
         f"assumed: the {options.observer} observer (--observer)",
     ]
-    lines += [
-        f"written: {path}"
-        for path in (options.output, options.checkpoint, options.json)
-        if path is not None
-    ]
+    lines += [f"written: {path}" for path in figures["written"]]
+    lines += [f"written: {options.json}"] * (options.json is not None)
     return "\n".join(lines) + "\n"
-
-
-class _Line:
-    """What the user sees while it renders; by itself nothing."""
-
-    def round(self, report: Report | None) -> None:
-        """Take note of a round."""
-
-    def part(self, samples: int, speed: float, ending: bool) -> None:
-        """Take note of samples so far, samples a second, and whether it ends with the round."""
-
-
-@contextlib.contextmanager
-def _live(options: argparse.Namespace) -> Iterator[_Line]:
-    """Show a live line on a terminal, and elsewhere a line a round, on standard error."""
-    from rich.console import Console
-    from rich.live import Live
-
-    console = Console(stderr=True, highlight=False, markup=False)
-    if not console.is_terminal:
-        yield _RoundLines(options.tolerance)
-        return
-    with Live(console=console, transient=True, auto_refresh=False) as live:
-        yield _LiveLine(live, options.tolerance)
-
-
-class _RoundLines(_Line):
-    """A line a round."""
-
-    def __init__(self, tolerance: float) -> None:
-        self._tolerance = tolerance
-        self._report: Report | None = None
-
-    def round(self, report: Report | None) -> None:
-        if report is not None and (self._report is None or report.round != self._report.round):
-            words = [f"round {report.round}", f"{report.spp:.4g} samples per pixel"]
-            words += _seen(report, self._tolerance)
-            print(f"vdm-render: {' · '.join(words)}", file=sys.stderr, flush=True)
-        self._report = report
-
-
-class _LiveLine(_Line):
-    """One line that changes."""
-
-    def __init__(self, live: Any, tolerance: float) -> None:
-        self._live, self._tolerance = live, tolerance
-        self._report: Report | None = None
-        self._shown = 0.0
-
-    def round(self, report: Report | None) -> None:
-        self._report = report
-
-    def part(self, samples: int, speed: float, ending: bool) -> None:
-        now = time.monotonic()
-        if now - self._shown < LINE_SECONDS:
-            return
-        self._shown = now
-        report = self._report
-        words = [f"round {1 if report is None else report.round + 1}"]
-        if report is not None:
-            words += [f"{samples / report.jnd.size:.4g} samples per pixel"]
-            words += _seen(report, self._tolerance)
-        words += [f"{speed / 1e6:.2f} million samples/s"]
-        if report is not None:
-            left = max(report.samples + report.forecast - samples, 0) / speed
-            words += [f"{_clock(left)} left"]
-        if ending:
-            words += ["ending with this round (Ctrl-C again: at once)"]
-        self._live.update(" · ".join(words), refresh=True)
-
-
-def _seen(report: Report, tolerance: float) -> list[str]:
-    """Return what a round's decision saw."""
-    return [
-        f"predicted maximum {report.predicted:.3g} JND",
-        f"{100.0 * report.over:.3g} % over {tolerance:g}",
-    ]
-
-
-def _clock(seconds: float) -> str:
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
 
 
 def _count(text: str) -> int:
@@ -594,6 +357,10 @@ def _seed(text: str) -> int:
             f"expected a whole number from 0 to {2**32 - 1}, got {text!r}"
         )
     return int(text)
+
+
+def _sensor(text: str) -> int | str:
+    return int(text) if text.isascii() and text.isdecimal() else text
 
 
 def _parameter(text: str) -> tuple[str, str]:

@@ -73,10 +73,19 @@ class Model:
         Of the samples so far.
     size
         Height and width.
+    look
+        Called before each long piece of work: whoever must not wait for all of it raises.
     """
 
-    def __init__(self, metric: VDM, statistics: Statistics, size: tuple[int, int]) -> None:
+    def __init__(
+        self,
+        metric: VDM,
+        statistics: Statistics,
+        size: tuple[int, int],
+        look: Callable[[], None] = lambda: None,
+    ) -> None:
         self.metric = metric
+        self._look = look
         self.size = size
         self.count = np.maximum(statistics.count, 1).reshape(size)
         # Nothing is known of a pixel without a finite sample, and no sample will help.
@@ -114,6 +123,7 @@ class Model:
         return self._uncorrected(None)
 
     def _uncorrected(self, count: NDArray[np.float64] | None) -> Tensor:
+        self._look()
         return _finest(self.errors.at(self.leaves(count)), self.cortex.grid)
 
     def largest(self, count: NDArray[np.float64] | None = None) -> float:
@@ -185,6 +195,7 @@ class Model:
         return slopes / slopes.sum().clamp_min(1e-300)
 
     def _totals(self, variance: Tensor, truth: Cortex) -> Tensor:
+        self._look()
         variances = detail_variances(variance, self.true_means)
         local = local_errors(self.metric, truth, variances, variance)
         return self._corrected(_finest(local, truth.grid))
@@ -227,6 +238,7 @@ class Model:
         largest = np.empty(0)
         visible: list[Tensor] = []
         while len(largest) < draws and not (len(largest) >= few and largest.mean() > tolerance):
+            self._look()
             batch = min(step, draws - len(largest))
             normal = torch.randn(batch, 3, height, width, generator=generator, dtype=torch.float32)
             noise = mix(mixing, normal)

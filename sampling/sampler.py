@@ -4,7 +4,7 @@ It draws nothing itself and knows no renderer. `rounds` is the loop that joins t
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, NamedTuple, Self
 
@@ -210,13 +210,17 @@ class Sampler:
         self._decided: StopReason | None = None
         self._report: Report | None = None
 
-    def ask(self) -> Request | None:
-        """Return what is left to draw of this round, or the next round, or None when stopped."""
+    def ask(self, look: Callable[[], None] = lambda: None) -> Request | None:
+        """Return what is left to draw of this round, or the next round, or None when stopped.
+
+        ``look`` is called now and then while it decides. What it raises ends the decision, of which
+        nothing is left: the next ``ask`` takes it anew.
+        """
         if self._report is not None and self._report.stop_reason is not None:
             return None
         left = self._left()
         if not left.any():
-            self._decide()
+            self._decide(look)
             left = self._left()
             if not left.any():
                 return None
@@ -315,13 +319,13 @@ class Sampler:
 
     @torch.inference_mode(False)
     @torch.enable_grad()
-    def _decide(self) -> None:
+    def _decide(self, look: Callable[[], None]) -> None:
         """End a round: predict, then stop, or say how many samples every pixel is to have.
 
         Placement takes derivatives, whatever the caller has switched off.
         """
         statistics = self._statistics
-        model = Model(self.metric, statistics, self.size)
+        model = Model(self.metric, statistics, self.size, look)
         predicted = model.predicted_maximum(self.settings.tolerance)
         totals = model.totals()
         largest = float(totals.max()) ** (1.0 / model.exponent)

@@ -90,12 +90,13 @@ def moments(samples: Samples, count: int) -> tuple[NDArray[np.float64], NDArray[
     return radiance.mean(1), radiance.var(1, ddof=1) / count
 
 
+@pytest.mark.parametrize("rfilter", ["box", "gaussian", "lanczos"])
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"])
 def test_sample_k_of_a_pixel_is_the_same_number_however_it_is_drawn(
-    scene: tuple[Path, dict[str, str]], variant: str
+    scene: tuple[Path, dict[str, str]], variant: str, rfilter: str
 ) -> None:
     path, parameters = scene
-    options: dict[str, Any] = {"seed": 5, "variant": variant}
+    options: dict[str, Any] = {"seed": 5, "variant": variant, "filter": rfilter}
     whole = MitsubaRenderer(path, parameters, **options)
     samples = draw(whole, 7)
     wanted = samples.radiance.reshape(-1, 7, 3)
@@ -284,6 +285,18 @@ def test_the_fingerprint_is_of_everything_that_is_named(mitsuba: Any, tmp_path: 
         (
             '<scene version="3.0.0">' + SENSOR.replace('"path"', '"prb"') + "</scene>",
             "expected an integrator that samples single rays",
+        ),
+        (
+            f'<scene version="3.0.0">{SENSOR}<shape type="sphere"/></scene>',
+            "expected a light, got none",
+        ),
+        (
+            '<scene version="3.0.0"><emitter type="constant"/>'
+            + SENSOR.replace(
+                '"path"/>', '"aov"><string name="aovs" value="dd:depth"/></integrator>'
+            )
+            + "</scene>",
+            "expected an integrator inside that of the type aov, got none",
         ),
     ],
 )

@@ -17,7 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 from benchmarks.places import ROOT
-from sampling import Samples, cli
+from sampling import Samples, rendering
 from sampling.cli import main
 from sampling.renderers.llvm import LLVMError, find_llvm
 from sampling.renderers.mitsuba import MitsubaRenderer, SceneError, load_mitsuba
@@ -37,9 +37,9 @@ PILOT = 16 * 12 * 8
 # A run that looks at the clock, and writes a checkpoint, every 300 samples.
 SLOW = """
 import sys
-from sampling import cli
-cli.CHECKPOINT_SECONDS = 0.0
-cli.FIRST_PART = cli.SMALLEST_PART = cli.LARGEST_PART = 300
+from sampling import cli, rendering
+rendering.CHECKPOINT_SECONDS = 0.0
+rendering.FIRST_PART = rendering.SMALLEST_PART = rendering.LARGEST_PART = 300
 sys.exit(cli.main())
 """
 
@@ -108,6 +108,26 @@ def test_the_image_and_the_figures(whole: tuple[list[str], Path]) -> None:
     np.testing.assert_array_equal(
         load(output).pixels.numpy(), np.stack([planes[name] for name in "RGB"])
     )
+    assert (told["filter"], told["plan"]["pixel_filter"]) == ("scene", "box")
+    assert OpenEXR.File(str(output)).header()["pixelFilter"].startswith("BoxFilter")
+
+
+def test_a_filter_is_chosen_and_told(scene: str, tmp_path: Path) -> None:
+    output = tmp_path / "out.exr"
+    words = [scene, *SMALL, "--max-spp", "16", "--aov", "--filter", "lanczos"]
+    assert main([*words, "--output", str(output), "--json", f"{output}.json"]) == 0
+    told = figures(Path(f"{output}.json"))
+    assert (told["filter"], told["plan"]["pixel_filter"]) == ("lanczos", "lanczos")
+    assert OpenEXR.File(str(output)).header()["pixelFilter"] == "LanczosSincFilter[lobes=3.000000]"
+    # The picture is the mean of samples of that filter.
+    renderer = MitsubaRenderer(scene, {"width": "12", "height": "8"}, filter="lanczos")
+    pixels = np.arange(96)
+    drawn = renderer.sample(pixels, 0 * pixels, 0 * pixels + 16)
+    mean = drawn.radiance.reshape(8, 12, 16, 3).mean(2, np.float64)
+    planes = channels(output)
+    np.testing.assert_allclose(
+        np.stack([planes[name] for name in "RGB"], -1), mean, rtol=1e-5, atol=1e-6
+    )
 
 
 def test_the_image_is_the_mean_of_the_pixels_samples(whole: tuple[list[str], Path]) -> None:
@@ -126,7 +146,7 @@ def test_the_same_command_gives_the_same_image_in_parts_of_any_size(
     whole: tuple[list[str], Path], tmp_path: Path, part: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("FIRST_PART", "SMALLEST_PART", "LARGEST_PART"):
-        monkeypatch.setattr(cli, name, part)
+        monkeypatch.setattr(rendering, name, part)
     arguments, output = whole
     assert main([*arguments, "--output", str(tmp_path / "again.exr")]) == 0
     same_image(tmp_path / "again.exr", output)
@@ -168,7 +188,7 @@ def test_ctrl_c_ends_the_round_and_says_how_to_go_on(
     with monkeypatch.context() as patch:
         patch.setattr(MitsubaRenderer, "sample", interrupted)
         for name in ("FIRST_PART", "SMALLEST_PART", "LARGEST_PART"):
-            patch.setattr(cli, name, 200)
+            patch.setattr(rendering, name, 200)
         json_path = tmp_path / "out.json"
         assert main([*arguments, "--output", str(output), "--json", str(json_path)]) == 130
     told = figures(json_path)
@@ -200,7 +220,7 @@ def test_ctrl_c_while_the_picture_is_written_loses_nothing(
         signal.raise_signal(signal.SIGINT)
         write_channels(*picture)
 
-    monkeypatch.setattr(cli, "write_channels", interrupted)
+    monkeypatch.setattr(rendering, "write_channels", interrupted)
     assert main([*arguments, "--output", str(output), "--checkpoint", str(kept)]) == 0
     same_image(output, wanted)
     assert kept.is_file()
@@ -253,6 +273,7 @@ def test_a_checkpoint_of_another_run_is_refused(
             ("--max-spp", "16", "--seed", "8", "--effects", "full"),
             "begun with --seed 7, and this is 8",
         ),
+        (("--max-spp", "16", "--filter", "tent"), "begun with --filter scene, and this is tent"),
         (("--max-spp", "16", "-D", "depth=3"), "another scene"),
         (("--max-spp", "16", "-D", "width=13"), "begun with image size 12 x 8"),
     ):
@@ -338,6 +359,7 @@ def test_what_is_not_finite_is_told(
         (("SCENE", "--max-spp", "1.5"), "expected a whole number over 0"),
         (("SCENE", "--seed", "-1"), "--seed"),
         (("SCENE", "--seed", "4294967296"), "expected a whole number from 0 to 4294967295"),
+        (("SCENE", "--filter", "sinc"), "--filter"),
         (("SCENE", "--noise-threshold", "0.1"), "expected the halfbuffer strategy"),
         (("SCENE", "--output", "out.png"), "out.png: expected a name that ends in .exr"),
         (("SCENE", "--output", "nowhere/out.exr"), "expected the folder to exist"),

@@ -1,6 +1,6 @@
 """The ask/tell loop: the same run whatever the batch or interruption, and an honest stop."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import Any
 
@@ -76,6 +76,40 @@ def test_interrupted_anywhere_it_continues_bit_for_bit(unbiased: bool) -> None:
         sampler = Sampler.restore(sampler.state(), METRIC)
         parts += 1
     assert parts > 5
+    assert_same_state(sampler.state(), whole.state())
+
+
+@pytest.mark.parametrize("unbiased", [False, True])
+def test_a_decision_that_is_given_up_leaves_nothing(unbiased: bool) -> None:
+    settings = Settings(tolerance=2.0, unbiased=unbiased)
+    whole, renderer = Sampler(SIZE, METRIC, settings), spotted()
+    finished(whole, renderer)
+    sampler = Sampler(SIZE, METRIC, settings)
+    given_up = 0
+
+    def patient_for(looks: int) -> Callable[[], None]:
+        left = iter(range(looks))
+
+        def look() -> None:
+            if next(left, None) is None:
+                raise TimeoutError
+
+        return look
+
+    looks = 0
+    while True:
+        before = sampler.state()
+        try:
+            request = sampler.ask(patient_for(looks))
+        except TimeoutError:
+            given_up, looks = given_up + 1, looks + 1
+            assert_same_state(sampler.state(), before)
+            continue
+        looks = 0
+        if request is None:
+            break
+        sampler.tell(renderer.sample(request.pixels, request.first, request.count))
+    assert given_up > 10
     assert_same_state(sampler.state(), whole.state())
 
 

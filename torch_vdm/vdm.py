@@ -261,7 +261,7 @@ class VDM(PairMetric):
         ----------
         test, reference
             (3, H, W) or (B, 3, H, W): tensors, or what is read part by part; see
-            `torch_vdm.tiling.Source`. Whole numbers of 8 and 16 bits stand for 0 to 1.
+            `torch_vdm.run.tiling.Source`. Whole numbers of 8 and 16 bits stand for 0 to 1.
         tile
             Pixels a side of a tile, 4 or more; rounded down to a multiple of what its levels need.
         out

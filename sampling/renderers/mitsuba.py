@@ -1,18 +1,20 @@
 """Mitsuba as the renderer: single pixels of a scene, sample by sample.
 
-The only file that imports mitsuba. Each sample is a ray through a pixel, followed by the scene's
-own integrator; its random numbers come from the pixel, the number of the sample and the seed. The
-film, its filter and the scene's sampler are left out: pixels are boxes, and their samples are
+The only file that imports mitsuba. Each sample is a ray through a place that is drawn from the
+pixel's filter, followed by the scene's own integrator; its random numbers come from the pixel, the
+number of the sample and the seed. The film and the scene's sampler are left out: samples are
 independent, as the statistics take them to be.
 """
 
+import contextlib
 import functools
 import hashlib
 import importlib
 import os
 import re
+import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sampling.renderers import hemisphere
+from sampling.renderers.filter import FILTERS, SCENE, PixelFilter
 from sampling.renderers.llvm import OLDEST, PACKAGE, VARIABLE, find_llvm
 from sampling.renderers.protocol import Samples
 
@@ -33,9 +36,16 @@ BATCH = 2**20
 # Of Dr.Jit's pool: with one thread, loading a bitmap never ends. Status: measured, Mitsuba 3.9.1.
 FEWEST_THREADS = 2
 
-# What is asked of the `aov` integrator, in its own words, and how many numbers it gives.
+# What is asked of the `aov` integrator, in its own words, and what its numbers are called.
 AOVS = "albedo:albedo,normal:sh_normal,depth:depth"
 AOV_NAMES = ("albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal.Z", "depth.Z")
+
+# What the share of rays that hit something is called; what stands for the integrator's own AOVs.
+ALPHA, OWN = "A", "own"
+
+
+# How the names of integrators begin whose picture is black where the scene has no light.
+LIT = ("path", "direct", "vol")
 
 
 class SceneError(ValueError):
@@ -48,31 +58,48 @@ class MitsubaRenderer:
     Parameters
     ----------
     scene
-        The XML file.
+        An XML file, a dict as `mi.load_dict` takes it, or an `mi.Scene`.
     parameters
-        Values for the scene's own parameters, ``<default name="..."/>``.
+        Values for the own parameters of a scene in a file, ``<default name="..."/>``.
+    sensor
+        Its number, from 0 on, its id, or an `mi.Sensor`.
     seed
         0 to 2^32 - 1; other seeds give independent images.
     aov
         Whether albedo, shading normal and depth are averaged in the same pass; depth is the length
-        of the ray, in the scene's units, and 0 where it hits nothing.
+        of the ray, in the scene's units, and 0 where it hits nothing. `OWN`: what the integrator
+        gives by itself.
+    integrator
+        One to render with in place of the scene's own; None: its own.
+    filter
+        One of `FILTERS`: the film's own, or another of Mitsuba's by name, as it is by default.
     variant
-        One of `VARIANTS`, or "auto": a GPU where there is one, else compiled code where there is an
-        LLVM, else the interpreted variant, with a warning.
+        One of `VARIANTS`, or "auto": that of an `mi.Scene`, for a dict the one that is set; else a
+        GPU where there is one, else compiled code where there is an LLVM, else the interpreted
+        variant, with a warning.
     batch
         Samples in one call of the compiled variants; changes memory and speed, and no bit.
 
     Attributes
     ----------
+    name
+        The file's name, or "the scene".
     variant, version
         The variant in use, and the version of Mitsuba.
+    sensor, sensors
+        Number and id of the sensor, and how many the scene has.
     size
         Height and width of the image, in pixels: the film's crop.
+    pixel_filter
+        The filter; its ``rays`` says how many each sample takes.
     fingerprint
-        A hash of the scene's file, of every file that it names, and of the parameters.
+        A hash of the scene's file, of every file that it names, and of the parameters; empty
+        of a scene that is not in a file.
+    planes
+        What is averaged beside the light: alpha where the film has it, then the AOVs.
     aov_sums
-        (8, H W), float64: sums of albedo R, G, B, normal X, Y, Z and depth, and how many samples
-        they are of; None without ``aov``. A continued run begins with those of the run before.
+        (P + 1, H W), float64: sums of the P ``planes``, and how many samples they are of; None
+        where there are none. A continued run begins with those of the run before.
 
     Raises
     ------
@@ -81,54 +108,74 @@ class MitsubaRenderer:
         rendered.
     LLVMError
         If DRJIT_LIBLLVM_PATH names a library that cannot be used.
+    ValueError
+        If the seed or the filter is none.
     """
 
     def __init__(
         self,
-        scene: str | os.PathLike[str],
+        scene: Any,
         parameters: Mapping[str, str] | None = None,
         *,
+        sensor: Any = 0,
         seed: int = 0,
-        aov: bool = False,
+        aov: bool | str = False,
+        integrator: Any = None,
+        filter: str = SCENE,  # noqa: A002  # what --filter is called
         variant: str = "auto",
         batch: int = BATCH,
     ) -> None:
         if not 0 <= seed < 2**32:
             raise ValueError(f"expected a seed from 0 to {2**32 - 1}, got {seed}")
-        self.path = Path(scene)
-        if not self.path.is_file():
-            what = "a folder or a device" if self.path.exists() else "no such file"
-            raise SceneError(f"{self.path}: expected a scene of Mitsuba (XML), got {what}")
-        self._mi = load_mitsuba(variant)
+        if filter not in FILTERS:
+            raise ValueError(f"expected a filter among {', '.join(FILTERS)}, got {filter!r}")
+        self.seed, self.filter, self._batch = seed, filter, batch
+        self.parameters = dict(parameters or {})
+        self.name, self.fingerprint = "the scene", ""
+        self.sensor: tuple[int | None, str]
+        if isinstance(scene, str | os.PathLike):
+            self._load_file(Path(scene), variant)
+        else:
+            self._take(scene, variant)
         self.variant: str = self._mi.variant()
         self.version: str = self._mi.__version__
-        self.seed, self._batch = seed, batch
-        self.parameters = dict(parameters or {})
-        state = self._parse()
-        self._scene = self._instantiate(state)
-        self._sensor = self._scene.sensors()[0]
-        width, height = (int(side) for side in self._sensor.film().crop_size())
+        self._sensor = self._chosen_sensor(sensor)
+        film = self._sensor.film()
+        width, height = (int(side) for side in film.crop_size())
         if width * height == 0:
             raise SceneError(
-                f"{self.path}: expected a film of at least one pixel, got {width} x {height}"
+                f"{self.name}: expected a film of at least one pixel, got {width} x {height}"
             )
         if width * height >= 2**31:
             raise SceneError(
-                f"{self.path}: expected fewer than 2^31 pixels, got {width} x {height}"
+                f"{self.name}: expected fewer than 2^31 pixels, got {width} x {height}"
             )
         self.size = height, width
-        self._integrator = self._sampling_integrator()
-        self._named = _integrator_names(self._mi, state)
-        filters = _nodes(self._mi, state, "ReconstructionFilter")
-        self._filter = filters[0].plugin_name() if filters else "gaussian (Mitsuba's default)"
-        self._aov_at = 0
-        self.aov_sums: NDArray[np.float64] | None = None
-        if aov:
+        self._integrator = self._sampling_integrator(integrator)
+        if integrator is not None or self.sensor[0] is None:
+            self.fingerprint = ""  # not all of it is in the file
+        self.pixel_filter = PixelFilter(
+            self._mi,
+            importlib.import_module("drjit"),
+            film,
+            film.rfilter() if filter == SCENE else self._mi.load_dict({"type": filter}),
+        )
+        self._alpha: bool = film.flags() & int(self._mi.FilmFlags.Alpha) != 0
+        self.planes = [ALPHA] if self._alpha else []
+        own = self._integrator.aov_names()
+        # In what the integrator gives: where what is wanted begins.
+        self._aov_at = 0 if aov == OWN else len(own)
+        if aov == OWN:
+            self.planes += own
+        elif aov:
             self._integrator = self._mi.load_dict(
                 {"type": "aov", "aovs": AOVS, "image": self._integrator}
             )
             self._aov_at = len(self._integrator.aov_names()) - len(AOV_NAMES)
-            self.aov_sums = np.zeros((len(AOV_NAMES) + 1, width * height))
+            self.planes += AOV_NAMES
+        self.aov_sums: NDArray[np.float64] | None = (
+            np.zeros((len(self.planes) + 1, width * height)) if self.planes else None
+        )
 
     def sample(
         self, pixels: NDArray[np.int64], first: NDArray[np.int64], count: NDArray[np.int64]
@@ -143,12 +190,13 @@ class MitsubaRenderer:
         radiance = np.empty((len(which), 3), np.float32)
         self._mi.set_variant(self.variant)  # someone else may have chosen another one
         draw = self._draw_one_by_one if self.variant.startswith("scalar") else self._draw
-        for begin in range(0, len(which), self._batch):
-            part = slice(begin, begin + self._batch)
+        at_once = max(self._batch // self.pixel_filter.rays, 1)
+        for begin in range(0, len(which), at_once):
+            part = slice(begin, begin + at_once)
             try:
                 radiance[part], aovs = draw(which[part], number[part])
             except RuntimeError as error:
-                raise SceneError(f"{self.path}: {_one_line(error)}") from error
+                raise SceneError(f"{self.name}: {_one_line(error)}") from error
             if self.aov_sums is not None:
                 for sums, plane in zip(self.aov_sums, [*aovs, None], strict=True):
                     sums += np.bincount(which[part], plane, len(sums))
@@ -159,17 +207,20 @@ class MitsubaRenderer:
     ) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
         """Draw samples in one call of compiled code."""
         mi, dr = self._mi, importlib.import_module("drjit")
-        drawn = len(pixels)
+        drawn, rays = len(pixels), self.pixel_filter.rays
         if drawn == 1:  # a width of one is compiled anew
             pixels, numbers = pixels.repeat(2), numbers.repeat(2)
-        pixel = mi.UInt32(pixels.astype(np.uint32))
+        ray = dr.arange(mi.UInt32, rays * len(pixels))
+        pixel = mi.UInt32(pixels.astype(np.uint32).repeat(rays))
+        number = mi.UInt32(numbers.astype(np.uint32).repeat(rays))
         sampler = _pixel_sampler(self.variant)
-        sampler.start(pixel, mi.UInt32(numbers.astype(np.uint32)), dr.opaque(mi.UInt32, self.seed))
+        sampler.start(pixel, number, dr.opaque(mi.UInt32, self.seed))
         width = self.size[1]
-        radiance, aovs = self._follow(sampler, mi.Float(pixel % width), mi.Float(pixel // width))
+        # Of two rays the second is taken off.
+        radiance, aovs = self._follow(sampler, pixel % width, pixel // width, (ray & 1) == 1)
         dr.eval(radiance, aovs)
-        planes = [np.asarray(plane.numpy())[:drawn] for plane in aovs]
-        return np.asarray(radiance.numpy()).T[:drawn], planes
+        planes = [np.asarray(plane.numpy()).reshape(-1, rays).sum(1)[:drawn] for plane in aovs]
+        return np.asarray(radiance.numpy()).T.reshape(-1, rays, 3).sum(1)[:drawn], planes
 
     def _draw_one_by_one(
         self, pixels: NDArray[np.int64], numbers: NDArray[np.int64]
@@ -182,56 +233,127 @@ class MitsubaRenderer:
         mi = self._mi
         sampler = mi.load_dict({"type": "independent"})
         width = self.size[1]
-        radiance = np.empty((len(pixels), 3), np.float32)
-        aovs = np.empty((len(pixels), len(AOV_NAMES) if self.aov_sums is not None else 0))
+        radiance = np.zeros((len(pixels), 3), np.float32)
+        aovs = np.zeros((len(pixels), len(self.planes)))
         for i, (pixel, number) in enumerate(zip(pixels.tolist(), numbers.tolist(), strict=True)):
             high, low = mi.sample_tea_32(pixel, self.seed)
-            sampler.seed(mi.sample_tea_32((high + number) % 2**32, low)[0], 1)
-            light, values = self._follow(sampler, float(pixel % width), float(pixel // width))
-            radiance[i] = light
-            aovs[i] = values
+            for negative in (False, True)[: self.pixel_filter.rays]:
+                sampler.seed(mi.sample_tea_32((high + number) % 2**32, low)[0], 1)
+                light, values = self._follow(sampler, pixel % width, pixel // width, negative)
+                radiance[i] += light
+                aovs[i] += values
         return radiance, list(aovs.T.astype(np.float32))
 
-    def _follow(self, sampler: Any, x: Any, y: Any) -> tuple[Any, list[Any]]:
-        """Return the light along a random ray through each pixel, and the pixel's AOVs."""
-        mi, sensor = self._mi, self._sensor
+    def _follow(self, sampler: Any, x: Any, y: Any, negative: Any) -> tuple[Any, list[Any]]:
+        """Return the light along a random ray for each pixel, and its AOVs, both weighted."""
+        mi, dr, sensor = self._mi, importlib.import_module("drjit"), self._sensor
         height, width = self.size
-        offset = sampler.next_2d()
-        position = mi.Point2f((x + offset.x) * (1.0 / width), (y + offset.y) * (1.0 / height))
+        place = self.pixel_filter.place(sampler, x, y, negative)
+        position = mi.Point2f(place.x * (1.0 / width), place.y * (1.0 / height))
         lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         time = mi.Float(sensor.shutter_open())
         if sensor.shutter_open_time() > 0.0:
             time += sampler.next_1d() * sensor.shutter_open_time()
         # No wavelength is sampled: the variants are RGB.
         ray, weight = sensor.sample_ray_differential(time, 0.5, position, lens)
-        light, _, aovs = self._integrator.sample(
+        light, valid, aovs = self._integrator.sample(
             self._scene, sampler, ray, sensor.get_medium(), True
         )
-        wanted = aovs[self._aov_at :] if self.aov_sums is not None else []
-        return weight * light, wanted
+        planes = [mi.Float(dr.select(valid, 1.0, 0.0))] if self._alpha else []
+        planes += aovs[self._aov_at :]
+        return weight * light * place.weight, [plane * place.weight for plane in planes]
 
-    def _parse(self) -> Any:
+    def _load_file(self, path: Path, variant: str) -> None:
+        """Load a scene from its file."""
+        self.name = str(path)
+        if not path.is_file():
+            what = "a folder or a device" if path.exists() else "no such file"
+            raise SceneError(f"{path}: expected a scene of Mitsuba (XML), got {what}")
+        self._mi = load_mitsuba(variant)
+        state = self._parse(path)
+        self._scene = self._instantiate(path, state)
+        self._named = _integrator_names(self._mi, state)
+
+    def _take(self, scene: Any, variant: str) -> None:
+        """Load a scene from a dict, or take it as it is."""
+        if self.parameters:
+            raise SceneError(
+                "expected parameters with a scene in a file alone; "
+                "put their values into the dict, or set them with mi.traverse"
+            )
+        loaded = None if isinstance(scene, Mapping) else getattr(scene, "variant_name", None)
+        if isinstance(scene, Mapping):
+            # What is in the dict may be of the variant that is set.
+            mi = sys.modules.get("mitsuba")
+            before = mi.variant() if mi is not None else None
+            variant = before if variant == "auto" and before in VARIANTS else variant
+        elif loaded is None or scene.class_name() != "Scene":
+            kind = type(scene).__name__ if loaded is None else scene.class_name()
+            raise SceneError(f"expected a scene: a path, a dict or an mi.Scene, got {kind}")
+        else:
+            if variant not in ("auto", loaded()):
+                raise SceneError(f"expected the variant of the scene, {loaded()}, got {variant}")
+            variant = loaded()
+            if variant not in VARIANTS:
+                raise SceneError(
+                    f"expected a scene of a variant among {', '.join(VARIANTS)}, got {variant}; "
+                    "set one of them before it is loaded"
+                )
+        self._mi = load_mitsuba(variant)
+        if loaded is None:
+            try:
+                scene = self._mi.load_dict(dict(scene))
+            except RuntimeError as error:
+                raise SceneError(f"{self.name}: {_one_line(error)}") from error
+            if not isinstance(scene, self._mi.Scene):
+                raise SceneError(
+                    f'{self.name}: expected a dict with "type": "scene", got one of a '
+                    f"{scene.class_name()}"
+                )
+        self._scene = scene
+        self._named = _innermost(str(scene.integrator()))
+
+    def _chosen_sensor(self, wanted: Any) -> Any:
+        """Return the sensor of a number or an id."""
+        sensors = self._scene.sensors()
+        self.sensors = len(sensors)
+        if isinstance(wanted, self._mi.Sensor):
+            self.sensor = sensors.index(wanted) if wanted in sensors else None, wanted.id()
+            return wanted
+        if not sensors:
+            raise SceneError(
+                f"{self.name}: expected a sensor, got none; add a <sensor> to the scene"
+            )
+        named = [sensor.id() for sensor in sensors]
+        if isinstance(wanted, str) and wanted and wanted in named:
+            wanted = named.index(wanted)
+        if not isinstance(wanted, int | np.integer) or not 0 <= wanted < len(sensors):
+            ids = ", ".join(name for name in named if name)
+            raise SceneError(
+                f"{self.name}: expected a sensor from 0 to {len(sensors) - 1}"
+                f"{f', or {ids}' if ids else ''}, got {wanted!r}"
+            )
+        self.sensor = int(wanted), named[wanted]
+        return sensors[wanted]
+
+    def _parse(self, path: Path) -> Any:
         """Read the file and what it includes, and hash all of it."""
         mi, parser = self._mi, self._mi.parser
         for name in ("config", "filename"):
             if name in self.parameters:
                 raise SceneError(
-                    f"{self.path}: Mitsuba cannot be given a parameter named {name!r}; "
+                    f"{path}: Mitsuba cannot be given a parameter named {name!r}; "
                     "call it otherwise in the scene"
                 )
-        config = parser.ParserConfig(self.variant)
+        config = parser.ParserConfig(self._mi.variant())
         try:
-            state = parser.parse_file(config, os.fspath(self.path), **self.parameters)
+            state = parser.parse_file(config, os.fspath(path), **self.parameters)
             included = list(state.files)
             parser.transform_all(config, state)
         except RuntimeError as error:
-            raise SceneError(f"{self.path}: {_one_line(error)}") from error
+            raise SceneError(f"{path}: {_one_line(error)}") from error
         if state.root.type != mi.ObjectType.Scene:
-            raise SceneError(f"{self.path}: expected a <scene> as the outermost element")
-        if not any(node.type == mi.ObjectType.Sensor for node in state.nodes):
-            raise SceneError(
-                f"{self.path}: expected a sensor, got none; add a <sensor> to the scene"
-            )
+            raise SceneError(f"{path}: expected a <scene> as the outermost element")
         named = sorted(
             {
                 str(value)
@@ -240,7 +362,7 @@ class MitsubaRenderer:
                 if isinstance(value, str)
             }
         )
-        found = [self.path.parent / name for name in named if name]
+        found = [path.parent / name for name in named if name]
         digest = hashlib.sha256()
         for name, value in sorted(self.parameters.items()):
             digest.update(f"{name}={value}\n".encode())
@@ -252,51 +374,78 @@ class MitsubaRenderer:
         self.fingerprint = digest.hexdigest()
         return state
 
-    def _instantiate(self, state: Any) -> Any:
+    def _instantiate(self, path: Path, state: Any) -> Any:
         """Build the scene; files that it names are looked for in its own folder first."""
         mi = self._mi
-        config = mi.parser.ParserConfig(self.variant)
+        config = mi.parser.ParserConfig(mi.variant())
         resolver = mi.FileResolver(mi.file_resolver())
-        resolver.prepend(os.fspath(self.path.resolve().parent))
+        resolver.prepend(os.fspath(path.resolve().parent))
         before = mi.file_resolver()
         mi.set_file_resolver(resolver)
         try:
             return mi.parser.instantiate(config, state)
         except RuntimeError as error:
-            raise SceneError(f"{self.path}: {_one_line(error)}") from error
+            raise SceneError(f"{path}: {_one_line(error)}") from error
         finally:
             mi.set_file_resolver(before)
 
-    def _sampling_integrator(self) -> Any:
-        """Return the scene's integrator, if light can be asked of it ray by ray."""
+    def _sampling_integrator(self, other: Any) -> Any:
+        """Return the scene's integrator, or another, if light can be asked of it ray by ray."""
         mi = self._mi
-        integrator = self._scene.integrator()
+        integrator = other or self._scene.integrator()
+        if other is not None:
+            self._named = _innermost(str(other))
         if integrator is None:
             raise SceneError(
-                f'{self.path}: expected an integrator, got none; add <integrator type="path"/>'
+                f'{self.name}: expected an integrator, got none; add <integrator type="path"/>'
             )
         # Those in Python are sampled in another way, and their base is not always loaded.
         names = {kind.__name__ for kind in type(integrator).__mro__}
         if not isinstance(integrator, mi.SamplingIntegrator) or "ADIntegrator" in names:
             raise SceneError(
-                f"{self.path}: expected an integrator that samples single rays, such as path, "
+                f"{self.name}: expected an integrator that samples single rays, such as path, "
                 f"volpath or direct, got {integrator.class_name()}"
+            )
+        name = self._named[0]
+        if name == "aov":
+            raise SceneError(
+                f"{self.name}: expected an integrator inside that of the type aov, got none, "
+                'whose picture is black; put <integrator type="path"/> into it'
+            )
+        dark = not self._scene.emitters() and self._scene.environment() is None
+        if dark and name.startswith(LIT):
+            raise SceneError(
+                f"{self.name}: expected a light, got none, and a picture that is black; "
+                "add an <emitter> to the scene"
             )
         return integrator
 
     def aovs(self) -> dict[str, NDArray[np.float64]]:
-        """Return the means of `AOV_NAMES` so far, (H, W) each, by name of channel."""
+        """Return the means of ``planes`` so far, (H, W) each, by name of channel."""
         if self.aov_sums is None:
             return {}
         *sums, count = self.aov_sums
         return {
             name: (plane / np.maximum(count, 1.0)).reshape(self.size)
-            for name, plane in zip(AOV_NAMES, sums, strict=True)
+            for name, plane in zip(self.planes, sums, strict=True)
         }
 
     def plan(self) -> dict[str, Any]:
         """Return what is simulated and why, for the JSON."""
-        return _plan(self._mi, self._scene, self._sensor, self._named, self._filter)
+        return _plan(self._mi, self._scene, self._sensor, self._named) | {
+            "sensor": (
+                f"number {self.sensor[0]} of {self.sensors}"
+                if self.sensor[0] is not None
+                else "none of the scene's own"
+            )
+            + (f", {self.sensor[1]}" if self.sensor[1] else ""),
+            "pixel_filter": self.pixel_filter.name,
+            "pixel_filter_why": (
+                f"{'the film has' if self.filter == SCENE else 'asked for:'} "
+                f"{self.pixel_filter.words}; rays are placed by it, "
+                f"{self.pixel_filter.rays} a sample"
+            ),
+        }
 
 
 def load_mitsuba(variant: str = "auto") -> Any:
@@ -323,7 +472,7 @@ def load_mitsuba(variant: str = "auto") -> Any:
         # Whoever imported Mitsuba before let Dr.Jit choose for itself, once and for all.
         raise SceneError(
             f"expected LLVM {OLDEST} or newer, got {dr.detail.llvm_version()[0]}, which was loaded "
-            f"when mitsuba was imported; load the scene before that, or set {VARIABLE}"
+            f"when mitsuba was imported; call sampling.find_llvm() before that, or set {VARIABLE}"
         )
     usable = {
         "cuda_ad_rgb": bool(dr.has_backend(dr.JitBackend.CUDA)),
@@ -349,6 +498,29 @@ def load_mitsuba(variant: str = "auto") -> Any:
     mi.set_log_level(mi.LogLevel.Error)
     _register_materials(variant)
     return mi
+
+
+@contextlib.contextmanager
+def preserved() -> Iterator[None]:
+    """Leave Mitsuba's variant and log level, and Dr.Jit's threads, as they were found.
+
+    Where Mitsuba was not imported yet it has a variant afterwards, for it cannot be left without.
+    """
+    mi, dr = sys.modules.get("mitsuba"), sys.modules.get("drjit")
+    found = None
+    if mi is not None and dr is not None:
+        found = mi.variant(), mi.log_level(), dr.thread_count()
+    try:
+        yield
+    finally:
+        mi, dr = sys.modules.get("mitsuba"), sys.modules.get("drjit")
+        if mi is not None and dr is not None:
+            variant, level, threads = found or (None, mi.LogLevel.Warn, dr.thread_count())
+            mi.set_log_level(level)
+            if variant is not None:
+                mi.set_variant(variant)
+            if dr.thread_count() != threads:
+                dr.set_thread_count(threads)
 
 
 @functools.cache
@@ -422,14 +594,23 @@ def _integrator_names(mi: Any, state: Any) -> tuple[str, int | None]:
     Of nested ones (aov, moment) the innermost.
     """
     found = _nodes(mi, state, "Integrator")
+    if not found:
+        return "", None
     inner = [node for node in found if not list(node.references())] or found
     depth = int(inner[-1].get("max_depth", -1))
     return inner[-1].plugin_name(), depth if depth >= 0 else None
 
 
-def _plan(
-    mi: Any, scene: Any, sensor: Any, integrator: tuple[str, int | None], rfilter: str
-) -> dict[str, Any]:
+def _innermost(words: str) -> tuple[str, int | None]:
+    """Return the same of an integrator that is loaded, from what Mitsuba says of it."""
+    names = re.findall(r"(\w+?)(?:Integrator)?\[\s", words)
+    depths = [int(depth) for depth in re.findall(r"max_depth = (\d+)", words)]
+    # Without a limit it is the largest number of 32 bits.
+    depth = depths[-1] if depths and depths[-1] < 2**31 else None
+    return (names[-1].lower() if names else words), depth
+
+
+def _plan(mi: Any, scene: Any, sensor: Any, integrator: tuple[str, int | None]) -> dict[str, Any]:
     """Return what is simulated and why."""
     name, depth = integrator
     shapes = scene.shapes()
@@ -484,9 +665,6 @@ def _plan(
     return {
         "integrator": name,
         "max_depth": depth,
-        "sensor": f"the first of {len(scene.sensors())}",
-        "pixel_filter": "box",
-        "pixel_filter_why": f"samples of a pixel stay in it; the scene's film asks for {rfilter}",
         "effects": [
             {"effect": effect, "simulated": simulated, "why": why}
             for effect, simulated, why in effects

@@ -1,0 +1,542 @@
+"""A scene rendered until nobody can see what is still missing: one run, from scene to picture.
+
+What `sampling.render` does, and ``vdm-render`` with it.
+"""
+
+import contextlib
+import json
+import os
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sampling import checkpoint as checkpoints
+from sampling.renderers.filter import SCENE
+from sampling.renderers.mitsuba import MitsubaRenderer, preserved
+from sampling.sampler import Report, Sampler, Settings, StrategyName, under
+from torch_vdm import VDM, Display, Observer, __version__
+from torch_vdm.io import atomic_path, write_channels
+from torch_vdm.model.distance import VISIBLE
+
+Plane = NDArray[np.float64]
+
+# Seconds between two checkpoints. Status: choice.
+CHECKPOINT_SECONDS = 30.0
+
+# Samples between two looks at the clock: at first, and then as many as take about so long. Neither
+# changes a bit of the image. Status: choice; a call has to be large to be fast.
+FIRST_PART, SMALLEST_PART, LARGEST_PART = 2**16, 2**12, 2**20
+PART_SECONDS = 0.5
+
+# Pixels below which the metric runs on one thread: more would gain little, and where the cores are
+# busy they wait for each other. Status: choice; measured at 96 x 64 on two busy cores, two threads
+# took 10 s for what one does in 0.7 s.
+FEW_PIXELS = 2**18
+
+# Seconds between two changes of the live line.
+LINE_SECONDS = 0.2
+
+# What `effects` may be, and why what is simulated is simulated.
+EFFECTS = {
+    "auto": "nothing is left out yet: what the scene names is simulated",
+    "full": "asked for: what the scene names is simulated",
+}
+
+
+class Watch:
+    """Who is told of a run while it goes on, and may end it; by itself nobody."""
+
+    def begin(self) -> None:
+        """Take note that the scene is loaded and rendering begins."""
+
+    def round(self, report: Report | None) -> None:
+        """Take note of a round."""
+
+    def part(self, samples: int, speed: float) -> None:
+        """Take note of samples so far and samples a second."""
+
+    def presses(self) -> int:
+        """Return 0 to go on, 1 to end with the round, 2 to end at once."""
+        return 0
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A rendered picture, and what is known of it."""
+
+    image: Plane
+    """(H, W, 3), linear BT.709. Filters with negative lobes may go below 0."""
+    samples: NDArray[np.int64]
+    """(H, W), how many each pixel's mean is of."""
+    jnd: Plane
+    """(H, W), the predicted visible difference from the converged image, in JND; infinite where
+    the run ended before it was predicted."""
+    variance: Plane
+    """(H, W, 3), the estimated variance of ``image``."""
+    aovs: dict[str, Plane]
+    """(H, W) each, by name of channel: alpha (A) where the scene's film has it, and albedo, shading
+    normal and depth where they were asked."""
+    report: Report | None
+    """What the last decision saw; None where the run ended before the first."""
+    stop_reason: str
+    """tolerance, noise_threshold, max_spp, time_limit or interrupted."""
+    converged: bool
+    """Whether it stopped because nobody should see what is missing, in any pixel."""
+    figures: dict[str, Any]
+    """What ``vdm-render --json`` says, but for what concerns its command."""
+    header: dict[str, str]
+    """What the file says of itself beside its channels."""
+    _run: "_Run" = field(repr=False)
+    """What a checkpoint is made of."""
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write an OpenEXR file of 32-bit floats, whole or not at all.
+
+        Its channels: R, G, B, and A where the scene's film has it; samples; jnd; variance.R, .G,
+        .B; albedo.R, .G, .B, normal.X, .Y, .Z and depth.Z where they were asked. Its header names
+        the reconstruction filter, as ``pixelFilter``.
+
+        Raises
+        ------
+        ImageError
+            If the name does not end in ``.exr``, or the file cannot be written.
+        """
+        import OpenEXR
+
+        planes: dict[str, NDArray[Any]] = dict(
+            zip("RGB", np.moveaxis(self.image, -1, 0), strict=True)
+        )
+        planes["samples"], planes["jnd"] = self.samples, self.jnd
+        for name, plane in zip("RGB", np.moveaxis(self.variance, -1, 0), strict=True):
+            planes[f"variance.{name}"] = plane
+        planes |= self.aovs
+        tensors = {name: torch.tensor(p, dtype=torch.float32) for name, p in planes.items()}
+        if Path(path).suffix.lower() != ".exr":
+            write_channels(path, tensors)  # refuses it in words
+        with atomic_path(path) as temporary:
+            write_channels(temporary, tensors)
+            with OpenEXR.File(str(temporary), separate_channels=True) as file:
+                file.header().update(self.header)
+                file.write(str(temporary))
+
+    def save_checkpoint(self, path: str | os.PathLike[str]) -> None:
+        """Write what a later run goes on from with ``resume``.
+
+        Raises
+        ------
+        CheckpointError
+            If it cannot be written, or the scene is not in a file.
+        """
+        self._run.save(Path(path))
+
+
+def render(
+    scene: Any,
+    tolerance: float = 1.0,
+    ppd: float = 60.0,
+    white: float = 100.0,
+    sensor: Any = 0,
+    seed: int = 0,
+    filter: str = SCENE,  # noqa: A002  # what --filter is called
+    *,
+    effects: str = "auto",
+    observer: Observer | None = None,
+    strategy: StrategyName = "perceptual",
+    max_spp: int | None = None,
+    time_limit: float | None = None,
+    noise_threshold: float | None = None,
+    unbiased: bool = False,
+    aov: bool | str = False,
+    integrator: Any = None,
+    parameters: dict[str, str] | None = None,
+    variant: str = "auto",
+    checkpoint: str | os.PathLike[str] | None = None,
+    resume: str | os.PathLike[str] | None = None,
+    watch: Watch | None = None,
+) -> Result:
+    """Render a scene of Mitsuba until nobody can see what is still missing.
+
+    The same arguments give the same image, bit for bit; ``time_limit`` alone is outside this.
+    Mitsuba's variant and log level are afterwards what they were, as are the numbers of threads.
+
+    Parameters
+    ----------
+    scene
+        An XML file, a dict as `mi.load_dict` takes it, or an `mi.Scene`, which is left as it is.
+    tolerance
+        Largest visible difference that may be left anywhere in the image, in JND, over 0.
+    ppd
+        Pixels per degree of vision, over 0.
+    white
+        Luminance of 1.0 in the picture, in cd/m2, over 0.
+    sensor
+        Number, from 0 on, or id, or an `mi.Sensor`.
+    seed
+        0 to 2^32 - 1; other seeds give independent images.
+    filter
+        The pixels' reconstruction filter: "scene", the film's own, or box, tent, gaussian,
+        mitchell, catmullrom or lanczos.
+    effects
+        "auto" or "full"; nothing is left out yet.
+    observer
+        Who judges; None: `Observer.calibrated`.
+    strategy, max_spp, noise_threshold, unbiased
+        See `Settings`.
+    time_limit
+        Seconds, scene and all; the first round is always completed. None: no limit.
+    aov
+        Whether to average albedo, shading normal and depth from the same rays; "own": what the
+        integrator gives by itself.
+    integrator
+        An `mi.Integrator` to render with in place of the scene's own; there is no checkpoint then.
+    parameters, variant
+        See `MitsubaRenderer`.
+    checkpoint
+        A file that is written now and then, and at the end. None: none.
+    resume
+        A file to go on from; where there is none yet, the run begins, with a warning.
+    watch
+        Who is told, and may end the run. Where standard error is a terminal a line on it says how
+        far it is, whoever else is told.
+
+    Returns
+    -------
+    Result
+        The picture and what is known of it, with ``save``.
+
+    Raises
+    ------
+    ValueError
+        Of one line, if an option is out of its range, the scene cannot be rendered (`SceneError`),
+        or a checkpoint is of another run or cannot be written (`CheckpointError`).
+    """
+    begun = time.monotonic()
+    # Those of NumPy cannot be written as JSON.
+    tolerance, ppd, white, seed = float(tolerance), float(ppd), float(white), int(seed)
+    if effects not in EFFECTS:
+        raise ValueError(f"expected effects among {', '.join(EFFECTS)}, got {effects!r}")
+    if time_limit is not None and not time_limit > 0.0:
+        raise ValueError(f"expected a time limit over 0 s, got {time_limit}")
+    settings = Settings(
+        strategy=strategy,
+        tolerance=tolerance,
+        max_spp=max_spp,
+        noise_threshold=noise_threshold,
+        unbiased=unbiased,
+    )
+    observer = observer or Observer.calibrated()
+    metric = VDM(ppd, Display.linear(white), observer)
+    with preserved():
+        renderer = MitsubaRenderer(
+            scene,
+            parameters,
+            sensor=sensor,
+            seed=seed,
+            aov=aov,
+            integrator=integrator,
+            filter=filter,
+            variant=variant,
+        )
+        height, width = renderer.size
+        # The sampler's own state says which settings it has; the rest is said here.
+        identity = {
+            **asdict(settings),
+            "version": __version__,
+            "mitsuba": renderer.version,
+            "variant": renderer.variant,
+            "size": f"{width} x {height}",
+            "scene": renderer.fingerprint,
+            "sensor": renderer.sensor[0],
+            "seed": seed,
+            "ppd": ppd,
+            "white": white,
+            "observer": observer.name,
+            "observer_numbers": json.dumps(asdict(observer), sort_keys=True),
+            "aov": aov,
+            "filter": filter,
+        }
+        run = _Run(renderer, Sampler(renderer.size, metric, settings), identity, begun)
+        if checkpoint is not None or resume is not None:
+            run.check_kept()
+        if resume is not None:
+            run.go_on(Path(resume))
+        few = height * width < FEW_PIXELS
+        with (
+            _threads(1 if few else torch.get_num_threads()),
+            _told(watch or Watch(), tolerance) as told,
+        ):
+            told.begin()
+            reason = run.until_done(told, time_limit or np.inf, checkpoint)
+        if checkpoint is not None:
+            run.save(Path(checkpoint))
+        return run.result(reason, effects)
+
+
+class _EndedError(Exception):
+    """A decision is not waited for; the run ends."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+@dataclass
+class _Run:
+    """A scene, its sampler, and what the run has cost, over all its interruptions."""
+
+    renderer: MitsubaRenderer
+    sampler: Sampler
+    identity: dict[str, Any]
+    begun: float
+    """When this part of the run began, by the monotonic clock."""
+    samples: int = 0
+    seconds: dict[str, float] = field(
+        default_factory=lambda: dict.fromkeys(("render", "metric", "total"), 0.0)
+    )
+    """Those for rays and for deciding; those of the parts before this one."""
+
+    def check_kept(self) -> None:
+        """Refuse a checkpoint of what could not be recognized."""
+        if not self.renderer.fingerprint:
+            raise checkpoints.CheckpointError(
+                "expected a scene in a file with a checkpoint, got one of which nobody could tell "
+                "whether it is the same; give its path"
+            )
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint."""
+        self.check_kept()
+        state = {f"sampler.{name}": v for name, v in self.sampler.state().items()}
+        if self.renderer.aov_sums is not None:
+            state["aov_sums"] = self.renderer.aov_sums
+        state["progress.samples"] = self.samples
+        for name, seconds in (self.seconds | {"total": self._total()}).items():
+            state[f"progress.seconds_{name}"] = seconds
+        checkpoints.save(path, checkpoints.Checkpoint(self.identity, state))
+
+    def go_on(self, path: Path) -> None:
+        """Begin where a checkpoint ends, or anew where there is none yet: the same image."""
+        if not path.exists():
+            warnings.warn(f"{path}: no checkpoint yet; starting from the beginning", stacklevel=3)
+            return
+        state = checkpoints.load(path, self.identity)
+        try:
+            self.sampler = Sampler.restore(under("sampler.", state), self.sampler.metric)
+            self.samples = state["progress.samples"]
+            self.seconds = {name: state[f"progress.seconds_{name}"] for name in self.seconds}
+            if self.renderer.aov_sums is not None:
+                self.renderer.aov_sums[:] = state["aov_sums"]
+        except (KeyError, TypeError) as error:
+            raise checkpoints.CheckpointError(
+                f"{path}: expected a whole checkpoint, got one without {error}; "
+                "start anew without --resume"
+            ) from error
+
+    def until_done(
+        self, watch: Watch, time_limit: float, checkpoint: str | os.PathLike[str] | None
+    ) -> str:
+        """Render until the sampler, the clock or the user says stop; return the reason."""
+        sampler, seconds = self.sampler, self.seconds
+        saved = time.monotonic()
+        at_once = FIRST_PART
+        drawn, drawing = 0, 0.0
+
+        def ended() -> str | None:
+            """Return why no more is to be done at all."""
+            if watch.presses() > 1:
+                return "interrupted"
+            # The first round is always completed: without it there is no image, and no prediction.
+            late = time.monotonic() - self.begun > time_limit
+            return "time_limit" if late and sampler.report() is not None else None
+
+        def look() -> None:
+            if (reason := ended()) is not None:
+                raise _EndedError(reason)
+
+        while True:
+            start = time.perf_counter()
+            try:
+                request = sampler.ask(look)
+            except _EndedError as ending:
+                return ending.reason
+            finally:
+                seconds["metric"] += time.perf_counter() - start
+            report = sampler.report()
+            watch.round(report)
+            if request is None:
+                assert report is not None
+                assert report.stop_reason is not None
+                return report.stop_reason
+            if report is not None and watch.presses():
+                return "interrupted"
+            for part in request.parts(at_once):
+                start = time.perf_counter()
+                samples = self.renderer.sample(part.pixels, part.first, part.count)
+                middle = time.perf_counter()
+                sampler.tell(samples)
+                end = time.perf_counter()
+                self.samples += part.samples
+                seconds["render"] += middle - start
+                seconds["metric"] += end - middle
+                drawn, drawing = drawn + part.samples, drawing + middle - start
+                watch.part(self.samples, drawn / drawing)
+                if checkpoint is not None and time.monotonic() - saved > CHECKPOINT_SECONDS:
+                    try:
+                        self.save(Path(checkpoint))
+                    except checkpoints.CheckpointError as error:  # a full disk: no reason to stop
+                        warnings.warn(str(error), stacklevel=3)
+                    saved = time.monotonic()
+                if (reason := ended()) is not None:
+                    return reason
+            speed = drawn / drawing
+            at_once = int(np.clip(PART_SECONDS * speed, SMALLEST_PART, LARGEST_PART))
+
+    def result(self, reason: str, effects: str) -> Result:
+        """Return the picture and what is known of it."""
+        sampler, renderer, report = self.sampler, self.renderer, self.sampler.report()
+        height, width = renderer.size
+        empty = int((sampler.count == 0).sum())
+        # A pixel without a finite sample is black, and nothing is known of it.
+        converged = report is not None and report.converged and not empty
+        identity = self.identity
+        figures = {
+            **{name: identity[name] for name in ("strategy", "seed", "tolerance")},
+            "rounds": report.round if report is not None else 0,
+            "samples_total": self.samples,
+            "spp_mean": self.samples / (height * width),
+            "predicted_max_jnd": report.predicted if report is not None else None,
+            "visible_fraction": (
+                float((report.jnd > VISIBLE).mean()) if report is not None else None
+            ),
+            "over_tolerance_fraction": report.over if report is not None else None,
+            "converged": converged,
+            "stop_reason": reason,
+            "seconds_render": self.seconds["render"],
+            "seconds_metric": self.seconds["metric"],
+            "seconds_total": self._total(),
+            "variant": renderer.variant,
+            "plan": {"effects_option": effects, "why": EFFECTS[effects], **renderer.plan()},
+            "samples_min": int(sampler.count.min()),
+            "samples_max": int(sampler.count.max()),
+            "nonfinite": report.nonfinite if report is not None else 0,
+            "pixels_empty": empty,
+            "black": not sampler.image.any(),
+            "unbiased": identity["unbiased"],
+            "width": width,
+            "height": height,
+            **{name: identity[name] for name in ("ppd", "white", "observer", "filter")},
+            "sensor": renderer.sensor[1] or renderer.sensor[0],
+            "sensors": renderer.sensors,
+            "version": __version__,
+            "mitsuba": renderer.version,
+        }
+        return Result(
+            image=sampler.image,
+            samples=sampler.count.copy(),
+            jnd=report.jnd if report is not None else np.full(sampler.size, np.inf),
+            variance=sampler.variance,
+            aovs=renderer.aovs(),
+            report=report,
+            stop_reason=reason,
+            converged=converged,
+            figures=figures,
+            header={
+                "software": f"vdm-render {__version__}",
+                "pixelFilter": renderer.pixel_filter.words,
+            },
+            _run=self,
+        )
+
+    def _total(self) -> float:
+        """Return the seconds of the run, those before an interruption included."""
+        return self.seconds["total"] + time.monotonic() - self.begun
+
+
+@contextlib.contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """Have torch compute on so many threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def terminal() -> Any:
+    """Return the console of standard error; its ``is_terminal`` says whether it shows a line."""
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False, markup=False)
+
+
+@contextlib.contextmanager
+def _told(watch: Watch, tolerance: float) -> Iterator[Watch]:
+    """Show a live line on a terminal, beside who else is told."""
+    from rich.live import Live
+
+    console = terminal()
+    if not console.is_terminal:
+        yield watch
+        return
+    with Live(console=console, transient=True, auto_refresh=False) as live:
+        yield _LiveLine(live, tolerance, watch)
+
+
+class _LiveLine(Watch):
+    """One line that changes."""
+
+    def __init__(self, live: Any, tolerance: float, beside: Watch) -> None:
+        self._live, self._tolerance, self._beside = live, tolerance, beside
+        self._report: Report | None = None
+        self._shown = 0.0
+
+    def begin(self) -> None:
+        self._beside.begin()
+
+    def presses(self) -> int:
+        return self._beside.presses()
+
+    def round(self, report: Report | None) -> None:
+        self._report = report
+        self._beside.round(report)
+
+    def part(self, samples: int, speed: float) -> None:
+        self._beside.part(samples, speed)
+        now = time.monotonic()
+        if now - self._shown < LINE_SECONDS:
+            return
+        self._shown = now
+        report = self._report
+        words = [f"round {1 if report is None else report.round + 1}"]
+        if report is not None:
+            words += [f"{samples / report.jnd.size:.4g} samples per pixel"]
+            words += seen(report, self._tolerance)
+        words += [f"{speed / 1e6:.2f} million samples/s"]
+        if report is not None:
+            left = max(report.samples + report.forecast - samples, 0) / speed
+            words += [f"{_clock(left)} left"]
+        if self.presses():
+            words += ["ending with this round (Ctrl-C again: at once)"]
+        self._live.update(" · ".join(words), refresh=True)
+
+
+def seen(report: Report, tolerance: float) -> list[str]:
+    """Return in words what a round's decision saw."""
+    return [
+        f"predicted maximum {report.predicted:.3g} JND",
+        f"{100.0 * report.over:.3g} % over {tolerance:g}",
+    ]
+
+
+def _clock(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
