@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from hypothesis import settings
 from numpy.typing import NDArray
 
 from benchmarks import places
+from sampling.renderers.llvm import LLVMError
+from sampling.renderers.mitsuba import SceneError, load_mitsuba
 from tests.reference import calibrated
 from torch_vdm import Haar, Observer
 from torch_vdm.model.cortex import Transform
@@ -28,6 +31,15 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no shared data at {folder}: set TORCH_VDM_DATA to its folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def mitsuba() -> Any:
+    """Return Mitsuba; a test that needs it is skipped where it cannot run."""
+    try:
+        return load_mitsuba("llvm_ad_rgb")
+    except (SceneError, LLVMError) as error:
+        pytest.skip(str(error))
 
 
 KINDS = ("random", "flat", "black", "hdr", "dark", "negative")

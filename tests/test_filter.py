@@ -11,8 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from sampling.renderers.filter import NAMES
-from sampling.renderers.llvm import LLVMError
-from sampling.renderers.mitsuba import AOV_NAMES, AOVS, MitsubaRenderer, SceneError, load_mitsuba
+from sampling.renderers.mitsuba import AOV_NAMES, AOVS, MitsubaRenderer
 from torch_vdm import VDM, Display
 
 FILTERS = tuple(NAMES.values())
@@ -65,15 +64,6 @@ SLIT = CROP.replace('"5"', '"1"')
 WIDER = '<boolean name="sample_border" value="true"/>'
 FILMS = {"whole": "", "crop": CROP, "slit": SLIT, "border sampled": WIDER, "both": CROP + WIDER}
 CASES = [*(("lamp", film) for film in FILMS), ("fog", "whole"), ("fog", "both")]
-
-
-@pytest.fixture(scope="module")
-def mitsuba() -> Any:
-    """Return Mitsuba; a test that needs it is skipped where it cannot run."""
-    try:
-        return load_mitsuba("llvm_ad_rgb")
-    except (SceneError, LLVMError) as error:
-        pytest.skip(str(error))
 
 
 def scene(folder: Path, name: str, rfilter: str, film: str = "") -> Path:

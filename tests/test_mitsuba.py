@@ -51,15 +51,6 @@ SENSOR = """
 
 
 @pytest.fixture(scope="module")
-def mitsuba() -> Any:
-    """Return Mitsuba; a test that needs it is skipped where it cannot run."""
-    try:
-        return load_mitsuba("llvm_ad_rgb")
-    except (SceneError, LLVMError) as error:
-        pytest.skip(str(error))
-
-
-@pytest.fixture(scope="module")
 def still_life(mitsuba: Any) -> Path:  # noqa: ARG001  # skips
     """Return the scene that ships with the package."""
     with as_file(files("sampling") / "scenes" / "still_life.xml") as path:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenEXR
 import pytest
 import torch
 from numpy.typing import NDArray
@@ -23,8 +22,8 @@ from sampling import Result, Samples, Watch, rendering
 from sampling.checkpoint import CheckpointError
 from sampling.cli import main
 from sampling.prediction import Model
-from sampling.renderers.llvm import LLVMError
-from sampling.renderers.mitsuba import MitsubaRenderer, SceneError, load_mitsuba
+from sampling.renderers.mitsuba import MitsubaRenderer, SceneError
+from tests.test_render_cli import channels
 from torch_vdm import Observer
 
 SMALL = {"width": "12", "height": "8"}
@@ -52,15 +51,6 @@ DARK: dict[str, Any] = {
 
 
 @pytest.fixture(scope="module")
-def mitsuba() -> Any:
-    """Return Mitsuba; what needs it is skipped where it cannot run."""
-    try:
-        return load_mitsuba("llvm_ad_rgb")
-    except (SceneError, LLVMError) as error:
-        pytest.skip(str(error))
-
-
-@pytest.fixture(scope="module")
 def path(mitsuba: Any) -> Path:  # noqa: ARG001  # skips
     """Return the scene that ships with the package."""
     with as_file(files("sampling") / "scenes" / "still_life.xml") as path:
@@ -79,12 +69,6 @@ def two(mitsuba: Any, tmp_path: Path) -> Path:  # noqa: ARG001  # skips
     scene = tmp_path / "two.xml"
     scene.write_text(TWO)
     return scene
-
-
-def channels(path: Path) -> dict[str, NDArray[np.float32]]:
-    """Return the channels of an EXR file."""
-    found = OpenEXR.File(str(path), separate_channels=True).channels()
-    return {name: channel.pixels for name, channel in found.items()}
 
 
 def same(one: Result, other: Result) -> None:
