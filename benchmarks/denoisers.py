@@ -42,8 +42,8 @@ Denoiser = Callable[[Tensor], Tensor]
 SAMPLES = (16, 64, 256)
 
 # Samples a pixel of each half of a reference; the halves tell how converged it is. Status: choice,
-# what eight scenes can take in ten minutes of one core.
-HALF_SPP = 2048
+# what eight scenes can take in a quarter of an hour of one core.
+HALF_SPP = 4096
 
 # Seeds of the halves; noisy renders have those from 1 on. Status: choice.
 HALVES = (0, 99)
@@ -54,7 +54,7 @@ SIDE = 128
 # Rooms and shared scenes that are denoised. None has a light that a path rarely finds: their
 # references would need many times the samples.
 ROOMS = range(1000, 1003)
-SHARED = ("dof row", "envmap glass", "textured wall", "cbox")
+SHARED = ("mis plates", "envmap glass", "textured wall", "cbox")
 
 # Of the bilateral filter: the deviation of its window in pixels, and of its differences in that of
 # the noise. Source: Zhang and Gunturk 2008, Multiresolution bilateral filtering for image
