@@ -34,6 +34,7 @@ from benchmarks.renders import Scene, exposed, exposure, held_out_scenes, render
 from torch_vdm import read_image, write_image
 from torch_vdm.cli import main as torch_vdm_command
 from torch_vdm.display import decode_srgb, encode_srgb
+from torch_vdm.evaluate.statistics import Paired
 
 Floats = NDArray[np.float32]
 Denoiser = Callable[[Tensor], Tensor]
@@ -77,6 +78,7 @@ FIGURES = (
 )
 MORE_IS_BETTER = ("psnr", "ssim")
 
+STILL = "still life"
 NOISY, GUIDED, UNGUIDED = "noisy", "OIDN, albedo and normal", "OIDN, colour"
 
 # The folder of each denoiser: names that a command line takes.
@@ -89,8 +91,8 @@ FOLDERS = {
     "U-Net": "unet",
 }
 
-# The picture that is shown, and its samples.
-SHOWN, SHOWN_SPP = "still life", 16
+# The scenes that are shown, where they are, and their samples.
+SHOWN, SHOWN_SPP = (STILL, "room 1001"), 16
 
 
 def run(quick: bool, output: Path | None) -> None:
@@ -110,7 +112,7 @@ def scenes(quick: bool) -> list[Scene]:
     if quick:
         return held_out_scenes(range(0), shared=False)
     found = held_out_scenes(ROOMS)
-    own = [scene for scene in found if scene.name.startswith("room") or scene.name == SHOWN]
+    own = [scene for scene in found if scene.name.startswith("room") or scene.name == STILL]
     return own + [scene for scene in found if scene.name in SHARED]
 
 
@@ -351,7 +353,7 @@ def _text(result: dict[str, Any]) -> str:
                 for figure, _, digits in FIGURES
             ]
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
-        lines.append("")
+        lines += ["", *_sentences(told["comparisons"]), ""]
     first = next(iter(samples.values()))["figures"]
     lines += ["## Largest difference by scene, JND", ""]
     lines.append("| scene | samples | " + " | ".join(first) + " |")
@@ -364,6 +366,13 @@ def _text(result: dict[str, Any]) -> str:
     lines += ["", f"Seconds for a picture, median, one thread for torch: {taken}.", ""]
     lines += [f"{name} is left out: {why}." for name, why in result["missing"].items()]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _sentences(comparisons: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return what `torch-vdm evaluate` says of each denoiser beside the noisy picture."""
+    noisy = FOLDERS[NOISY]
+    pairs = [each for each in comparisons if each["figure"] == "max_jnd" and each["one"] == noisy]
+    return [f"- {Paired(**each).sentence('Maximum')}" for each in pairs]
 
 
 def _cell(column: Mapping[str, float | None], name: str, digits: int, more: bool) -> str:
@@ -379,38 +388,39 @@ def _cell(column: Mapping[str, float | None], name: str, digits: int, more: bool
 def _plot(
     result: Mapping[str, Any], work: Path, spp: int, names: Sequence[str], path: Path
 ) -> None:
-    """Draw a scene by each denoiser with its map, and figures against samples beneath."""
+    """Draw scenes by each denoiser with their maps, and figures against samples beneath."""
     from torch_vdm import VDM, Display, StationaryHaar
 
-    reference = read_image(work / "reference" / f"{SHOWN}.exr")[None]
     metric = VDM(PPD, Display.linear(WHITE), transform=StationaryHaar(csf="filter"))
-    figure = blank_figure(2.2 * (len(names) + 1), 8.2)
-    parts: Any = figure.subfigures(2, 1, height_ratios=(4.6, 3.6))
+    shown = [scene for scene in SHOWN if scene in result["scenes"]]
+    figure = blank_figure(2.2 * (len(names) + 1), 4.6 * len(shown) + 3.6)
+    parts: Any = figure.subfigures(2, 1, height_ratios=(4.6 * len(shown), 3.6))
     above, beneath = parts
-    axes: Any = above.subplots(2, len(names) + 1)
+    axes: Any = above.subplots(2 * len(shown), len(names) + 1)
     for axis in axes.flat:
         axis.set_axis_off()
     drawn: Any = None
-    for (picture, below), name in zip(axes.T, names, strict=False):
-        image = read_image(work / str(spp) / FOLDERS[name] / f"{SHOWN}.exr")[None]
-        with torch.no_grad():
-            jnd = metric(image, reference)[0, 0]
-        picture.imshow(_screen(image), interpolation="nearest")
-        picture.set_title(f"{name}" if name != NOISY else f"{spp} samples", fontsize=9)
-        drawn = below.imshow(
-            jnd.numpy(), cmap="inferno", vmin=0.0, vmax=4.0, interpolation="nearest"
-        )
-        told = result["samples"][str(spp)]["figures"][name][SHOWN]
-        below.set_title(
-            f"max {told['max_jnd']:.1f} JND, {told['visible_fraction']:.0%} visible", fontsize=8
-        )
-    axes[0, -1].imshow(_screen(reference), interpolation="nearest")
-    axes[0, -1].set_title("reference", fontsize=9)
-    bar = axes[1, -1].inset_axes((0.02, 0.05, 0.07, 0.9))
-    above.colorbar(drawn, cax=bar, label="JND", extend="max")
+    for row, scene in enumerate(shown):
+        reference = read_image(work / "reference" / f"{scene}.exr")[None]
+        pictures, maps = axes[2 * row], axes[2 * row + 1]
+        for picture, below, name in zip(pictures, maps, names, strict=False):
+            image = read_image(work / str(spp) / FOLDERS[name] / f"{scene}.exr")[None]
+            with torch.no_grad():
+                jnd = metric(image, reference)[0, 0].numpy()
+            picture.imshow(_screen(image), interpolation="nearest")
+            picture.set_title(f"{spp} samples" if name == NOISY else name, fontsize=9)
+            drawn = below.imshow(jnd, cmap="inferno", vmin=0.0, vmax=4.0, interpolation="nearest")
+            told = result["samples"][str(spp)]["figures"][name][scene]
+            below.set_title(
+                f"max {told['max_jnd']:.1f} JND, {told['visible_fraction']:.0%} visible", fontsize=8
+            )
+        pictures[-1].imshow(_screen(reference), interpolation="nearest")
+        pictures[-1].set_title("reference", fontsize=9)
+        bar = maps[-1].inset_axes((0.02, 0.05, 0.07, 0.9))
+        above.colorbar(drawn, cax=bar, label="JND", extend="max")
     curves: Any = beneath.subplots(1, 3)
-    shown = [each for each in FIGURES if each[0] in ("max_jnd", "visible_fraction", "psnr")]
-    for axis, (name_of, heading, _) in zip(curves, shown, strict=True):
+    drawn_figures = [each for each in FIGURES if each[0] in ("max_jnd", "visible_fraction", "psnr")]
+    for axis, (name_of, heading, _) in zip(curves, drawn_figures, strict=True):
         for name in names:
             values = [mean(told["figures"][name], name_of) for told in result["samples"].values()]
             axis.plot([int(each) for each in result["samples"]], values, "o-", label=name)
