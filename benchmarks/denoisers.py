@@ -92,7 +92,7 @@ FOLDERS = {
 }
 
 # The scenes that are shown, where they are, and their samples.
-SHOWN, SHOWN_SPP = (STILL, "room 1001"), 16
+SHOWN, SHOWN_SPP = (STILL, "room 1001", "mis plates"), 16
 
 
 def run(quick: bool, output: Path | None) -> None:
