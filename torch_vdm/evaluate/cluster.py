@@ -120,10 +120,11 @@ class _Hands:
     def take(self, waiting: Iterator[Job]) -> bool:
         """Hand out jobs while there is room; say whether any are in hand."""
         for job in islice(waiting, max(0, self._room() - len(self._jobs))):
-            future = self._client.submit(
-                _judged, self._sent, _placed(job), self._known.get((job.frame, job.test)),
-                pure=False,
-            )  # fmt: skip
+            known = self._known.get((job.frame, job.test))
+            try:
+                future = self._client.submit(_judged, self._sent, _placed(job), known, pure=False)
+            except Exception as error:  # a connection breaks in many ways
+                raise _lost() from error
             self._jobs[future] = job
             self._coming.add(future)
         return bool(self._jobs)
@@ -145,7 +146,7 @@ class _Hands:
         if now - self._asked > BELIEVED:
             try:
                 threads = sum(self._client.nthreads().values())
-            except (OSError, distributed.client.ClosedClientError) as error:
+            except Exception as error:  # a connection breaks in many ways
                 raise _lost() from error
             self._most = max(FEWEST_IN_HAND, IN_HAND_PER_THREAD * threads)
             self._asked = now
