@@ -88,6 +88,19 @@ def picture(
 
     The reference is of other random numbers than every take.
     """
+    noisy = [rendered(scene, cache, side, 1 + take, noisy_spp, True) for take in range(takes)]
+    reference = rendered(scene, cache, side, 0, reference_spp)
+    return exposed(scene.name, np.stack(noisy), reference)
+
+
+def rendered(
+    scene: Scene, cache: Path, side: int, seed: int, spp: int, guides: bool = False
+) -> NDArray[np.float32]:
+    """Return a render of ``spp`` samples a pixel, or read it from ``cache``.
+
+    (3, H, W), linear BT.709 in the scene's own units; (10, H, W) with ``guides``, of which the
+    depth is in the scene's units too. Other seeds are of other random numbers.
+    """
     cache.mkdir(parents=True, exist_ok=True)
     if isinstance(scene.source, str):
         path = cache / f"{scene.name.replace(' ', '_')}.xml"
@@ -95,22 +108,16 @@ def picture(
             temporary.write_text(scene.source)
     else:
         path = scene.source
-    parameters = dict.fromkeys(scene.size, str(side))
-
-    def render(seed: int, spp: int, guides: bool) -> NDArray[np.float32]:
-        renderer = MitsubaRenderer(path, parameters, seed=seed, aov=guides)
-        what = f"{renderer.fingerprint} {renderer.version} {seed} {spp} {guides}"
-        kept = cache / f"{path.stem}_{hashlib.sha256(what.encode()).hexdigest()[:16]}.npy"
-        if not kept.exists():
-            colour = _colour(renderer, spp)
-            planes = np.concatenate((colour, [*renderer.aovs().values()])) if guides else colour
-            with atomic_path(kept) as temporary, temporary.open("wb") as file:
-                np.save(file, planes.astype(np.float32))
-        stored: NDArray[np.float32] = np.load(kept)
-        return stored
-
-    noisy = np.stack([render(1 + take, noisy_spp, guides=True) for take in range(takes)])
-    return _exposed(scene.name, noisy, render(0, reference_spp, guides=False))
+    renderer = MitsubaRenderer(path, dict.fromkeys(scene.size, str(side)), seed=seed, aov=guides)
+    what = f"{renderer.fingerprint} {renderer.version} {seed} {spp} {guides}"
+    kept = cache / f"{path.stem}_{hashlib.sha256(what.encode()).hexdigest()[:16]}.npy"
+    if not kept.exists():
+        colour = _colour(renderer, spp)
+        planes = np.concatenate((colour, [*renderer.aovs().values()])) if guides else colour
+        with atomic_path(kept) as temporary, temporary.open("wb") as file:
+            np.save(file, planes.astype(np.float32))
+    stored: NDArray[np.float32] = np.load(kept)
+    return stored
 
 
 def _colour(renderer: MitsubaRenderer, spp: int) -> NDArray[np.float64]:
@@ -128,13 +135,18 @@ def _colour(renderer: MitsubaRenderer, spp: int) -> NDArray[np.float64]:
     return (total.T / spp).reshape(3, height, width)
 
 
-def _exposed(name: str, noisy: NDArray[np.float32], reference: NDArray[np.float32]) -> Picture:
+def exposed(name: str, noisy: NDArray[np.float32], reference: NDArray[np.float32]) -> Picture:
     """Expose a picture by its reference, and bring depth into 0 to 1."""
-    luminance = np.tensordot(LUMINANCE, reference.astype(np.float64), 1)
-    # The floor keeps a black background from setting the exposure.
-    mean = np.exp(np.log(luminance + 1e-2 * luminance.mean()).mean())
+    scale = exposure(reference)
     shots = torch.from_numpy(noisy.copy())
-    shots[:, :3] *= GREY / mean
+    shots[:, :3] *= scale
     depth = shots[:, -1:]
     shots[:, -1:] = depth / (depth + depth.mean().clamp_min(1e-6))
-    return Picture(name, shots, torch.from_numpy(reference * np.float32(GREY / mean)))
+    return Picture(name, shots, torch.from_numpy(reference * np.float32(scale)))
+
+
+def exposure(reference: NDArray[np.float32]) -> float:
+    """Return what brings the geometric mean luminance of a picture (3, H, W) to `GREY`."""
+    luminance = np.tensordot(LUMINANCE, reference.astype(np.float64), 1)
+    # The floor keeps a black background from setting the exposure.
+    return float(GREY / np.exp(np.log(luminance + 1e-2 * luminance.mean()).mean()))

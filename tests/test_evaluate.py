@@ -183,19 +183,26 @@ def wait_for_lines(process: "subprocess.Popen[bytes]", path: Path, count: int) -
 
 
 @pytest.mark.parametrize(
-    ("jobs", "ending", "status"), [("2", signal.SIGINT, 130), ("1", signal.SIGKILL, -9)]
+    ("jobs", "ending", "status"),
+    [
+        (["--jobs=2"], signal.SIGINT, 130),
+        (["--jobs=1"], signal.SIGKILL, -9),
+        (["--jobs=2", "--scheduler=local"], signal.SIGINT, 130),
+    ],
 )
 def test_what_is_done_outlives_an_end(
     folders: Path,
-    jobs: str,
+    jobs: list[str],
     ending: signal.Signals,
     status: int,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    if "--scheduler=local" in jobs:
+        pytest.importorskip("distributed")
     for number in range(FRAMES, 150):  # so that there is always something left to do
         for name in ("ref", "a", "b"):
             (folders / f"{name}/{number:03}.exr").symlink_to(folders / f"{name}/000.exr")
-    command = [sys.executable, "-m", "torch_vdm", *arguments(folders, "--jobs", jobs)]
+    command = [sys.executable, "-m", "torch_vdm", *arguments(folders, *jobs)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
     lines = folders / "out/journal.jsonl"
     wait_for_lines(process, lines, 3)
@@ -311,3 +318,4 @@ def test_a_peer_that_is_not_installed_is_told(
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     assert "pip install" in one_line(capsys, *arguments(folders, "--peers", "flip"))
     assert "pyarrow" in one_line(capsys, *arguments(folders, "--parquet"))
+    assert "torch-vdm[cluster]" in one_line(capsys, *arguments(folders, "--scheduler", "local"))

@@ -4,7 +4,7 @@ import argparse
 import importlib.util
 import io
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from itertools import combinations
 from pathlib import Path
@@ -76,7 +76,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     work = parser.add_argument_group("work")
     work.add_argument("--output", type=Path, required=True, metavar="DIR", help="where results go")
     work.add_argument(
-        "--jobs", type=_count, default=1, metavar="N", help="processes that share the work (1)"
+        "--jobs",
+        type=_count,
+        metavar="N",
+        help="processes that share the work (1; with --scheduler local one a processor)",
+    )
+    work.add_argument(
+        "--scheduler",
+        metavar="ADDRESS|FILE|local",
+        help="share the work among the workers of a Dask scheduler: its address, tcp://host:8786, "
+        "or its scheduler file; 'local' starts one with --jobs workers on this machine",
     )
     work.add_argument(
         "--resume", action="store_true", help="go on: what is done with these settings stands"
@@ -162,13 +171,22 @@ def _matched(options: argparse.Namespace) -> Matched:
 
 
 def _check_installed(options: argparse.Namespace) -> None:
-    """Refuse, before anything is computed, what would fail for a package."""
+    """Refuse, before anything is computed, what would fail for a package or has no meaning."""
+    if options.jobs and options.scheduler not in (None, "local"):
+        raise EvaluationError(
+            "expected --jobs or the --scheduler of a cluster, which has its own workers, got both; "
+            "leave --jobs out"
+        )
     missing = peers.missing(options.peers)
     if missing:
         raise EvaluationError(f"--peers {','.join(missing)}: not installed; {peers.EXTRA}")
     if options.parquet and importlib.util.find_spec("pyarrow") is None:
         raise EvaluationError(
             "--parquet: pyarrow is not installed; pip install 'torch-vdm[report]'"
+        )
+    if options.scheduler and importlib.util.find_spec("distributed") is None:
+        raise EvaluationError(
+            "--scheduler: Dask is not installed; pip install 'torch-vdm[cluster]'"
         )
 
 
@@ -205,7 +223,7 @@ def _worked_through(
     judge = Judge(bench, options, options.output)
     with (
         Journal(options.output) as lines,
-        closing(workers.results(judge, matched.jobs, known, options.jobs)) as coming,
+        closing(_coming(judge, matched.jobs, known, options)) as coming,
         _progress(matched.jobs) as advance,
     ):
         for key, result in results.items():
@@ -223,6 +241,20 @@ def _worked_through(
     return [
         results[key] for key in sorted(results, key=lambda key: (natural(key[0]), place[key[1]]))
     ]
+
+
+def _coming(
+    judge: Judge,
+    jobs: Sequence[Job],
+    known: dict[tuple[str, str], Result],
+    options: argparse.Namespace,
+) -> Generator[Result, None, None]:
+    """Yield the results of jobs as they come, from a cluster or from processes of this machine."""
+    if options.scheduler is None:
+        return workers.results(judge, jobs, known, options.jobs or 1)
+    from torch_vdm.evaluate import cluster  # which needs Dask
+
+    return cluster.results(judge, jobs, known, options.scheduler, options.jobs)
 
 
 def _add(lines: Journal, known: Result | None, result: Result) -> None:

@@ -1,6 +1,7 @@
 """Which files belong together: frames found by name in folders, by patterns, or in a manifest."""
 
 import csv
+import fnmatch
 import glob
 import json
 import re
@@ -22,7 +23,8 @@ COLUMNS = ("frame", "reference", "test", "path")
 # be added. Status: choice.
 LONGEST_PART = 240
 
-WILDCARDS = re.compile(r"\*\*/?|\*|\?|\[!?\]?[^\]]*\]")
+# As `glob` reads them: a bracket that nothing closes in its folder's name stands for itself.
+WILDCARDS = re.compile(r"\*\*/?|\*|\?|\[!?+\]?+[^\]/]*+\]")
 
 
 class EvaluationError(ValueError):
@@ -189,9 +191,16 @@ def _by_pattern(pattern: str) -> Iterator[tuple[str, Path]]:
     expressions = [_expression(each) for each in (without_suffix, pattern)]
     for found in glob.glob(pattern, recursive=True):  # noqa: PTH207 - Path.glob needs a root
         path = Path(found)
+        if not path.name:  # the root of all
+            continue
         stem = path.with_suffix("").as_posix()
-        for expression, joints in expressions:
-            matched = expression.fullmatch(stem)
+        # A wildcard may stand for a part of the suffix too, as in '*exr'.
+        for (expression, joints), name in (
+            (expressions[0], stem),
+            (expressions[1], stem),
+            (expressions[1], path.as_posix()),
+        ):
+            matched = expression.fullmatch(name)
             if matched:
                 yield _joined(joints, matched.groups()), path
                 break
@@ -221,8 +230,8 @@ def _group(wildcard: str) -> str:
     if wildcard.startswith("**"):
         return "(.*/)?" if wildcard.endswith("/") else "(.*)"
     if wildcard.startswith("["):
-        inside = wildcard[1:-1].replace("\\", r"\\")
-        return f"([^{inside[1:]}])" if inside.startswith("!") else f"([{inside}])"
+        # What `glob` makes of it, without what surrounds it: (?s:...) and the end of the text.
+        return f"({fnmatch.translate(wildcard)[4:-3]})"
     return "([^/]*)" if wildcard == "*" else "([^/])"
 
 
@@ -266,10 +275,10 @@ def _fits(name: str) -> bool:
     parts = name.split("/")
     return (
         all(part not in ("", ".", "..") for part in parts)
-        and all(len(part.encode(errors="surrogateescape")) <= LONGEST_PART for part in parts)
         and "\\" not in name
         and ":" not in parts[0][:2]
-        and name.isprintable()
+        and name.isprintable()  # half a surrogate pair, which has no bytes, is not
+        and all(len(part.encode()) <= LONGEST_PART for part in parts)
     )
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import zlib
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -11,6 +12,10 @@ from typing import Any, Self
 from torch_vdm.io import ImageError
 
 NAME = "journal.jsonl"
+
+# What a line has beside a result: CRC-32 of the rest as JSON. A disk may change a digit, and the
+# line would still be read.
+CHECK = "check"
 
 # Bytes that are looked through at once for the end of the last whole line. Status: choice.
 BLOCK = 2**16
@@ -63,8 +68,10 @@ class Result:
     seconds: tuple[float, float] = (0.0, 0.0)
 
     def line(self) -> bytes:
-        """Return the result as JSON on one line."""
-        return json.dumps(asdict(self), allow_nan=False).encode() + b"\n"
+        """Return the result as JSON on one line, with a checksum of all the rest."""
+        fields = asdict(self)
+        check = _checksum(json.dumps(fields, allow_nan=False))
+        return json.dumps(fields | {CHECK: check}).encode() + b"\n"
 
 
 class Journal:
@@ -102,7 +109,7 @@ class Journal:
 def read(folder: Path) -> dict[tuple[str, str], Result]:
     """Return the last result of each frame and test in the journal of a folder.
 
-    A torn last line, and a line that another version wrote, count for nothing.
+    A torn last line, and one that was damaged or that another version wrote, count for nothing.
     """
     return {(result.frame, result.test): result for result in _results(folder / NAME)}
 
@@ -118,10 +125,16 @@ def _results(path: Path) -> Iterator[Result]:
                 return
             try:
                 fields: Any = json.loads(line)
-                result = Result(**fields)
-            except (ValueError, TypeError, RecursionError):
+                check = fields.pop(CHECK)
+                result = Result(**fields) if check == _checksum(json.dumps(fields)) else None
+            except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
                 continue
-            yield result
+            if result is not None:
+                yield result
+
+
+def _checksum(text: str) -> int:
+    return zlib.crc32(text.encode())
 
 
 def _drop_torn_line(path: Path) -> None:

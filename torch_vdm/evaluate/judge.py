@@ -30,7 +30,7 @@ MAPS, PICTURES = "maps", "pictures"
 # Options that change no figure: where things lie, and how they are worked through.
 NOT_SETTINGS = (
     "command", "reference", "test", "manifest", "output", "jobs", "resume", "fail_above", "junit",
-    "parquet", "tile",
+    "parquet", "scheduler", "tile",
 )  # fmt: skip
 
 

@@ -93,7 +93,7 @@ def _start(
     context = get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs, judge, threads), daemon=True)
-    with _no_interrupts():
+    with no_interrupts():
         process.start()
     theirs.close()
     hands[ours] = _Hand(process, job)
@@ -125,7 +125,7 @@ def _died(connection: Connection, hand: _Hand) -> Result:
 
 
 @contextmanager
-def _no_interrupts() -> Iterator[None]:
+def no_interrupts() -> Iterator[None]:
     """Let processes that are started here never see Ctrl-C, which is this process's to answer."""
     if threading.current_thread() is not threading.main_thread():
         yield
