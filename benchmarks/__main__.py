@@ -12,6 +12,8 @@ BENCHMARKS = {
     "calibrate": "fit the observer to human thresholds; 15 minutes, 1 with --quick",
     "denoisers": "what Open Image Denoise and others leave visible; 15 minutes, 30 seconds with "
     "--quick",
+    "effects": "what each effect costs, and what leaving it out shows; 5 minutes, 10 seconds with "
+    "--quick",
     "large": "memory on images up to 16,384 x 16,384; 15 minutes, 15 seconds with --quick",
     "oracle": "the fewest samples that placement could need; 15 minutes, 10 seconds with --quick",
     "overhead": "what deciding costs beside rendering; 10 minutes, 10 seconds with --quick",

@@ -33,8 +33,8 @@ from benchmarks.record import blank_figure, caption, circumstances, save
 from benchmarks.renders import Scene, exposed, exposure, held_out_scenes, rendered
 from torch_vdm import read_image, write_image
 from torch_vdm.cli import main as torch_vdm_command
-from torch_vdm.model.display import decode_srgb, encode_srgb
 from torch_vdm.evaluate.statistics import Paired
+from torch_vdm.model.display import decode_srgb, encode_srgb
 
 Floats = NDArray[np.float32]
 Denoiser = Callable[[Tensor], Tensor]

@@ -246,6 +246,13 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     )
     model.add_argument("--observer", choices=tuple(OBSERVERS), default="calibrated")
     model.add_argument(
+        "--effects",
+        choices=("auto", "full"),
+        default="auto",
+        help="auto: what a pair does not call for is not computed, which changes no figure but its "
+        "last bits (default); full: all of it is",
+    )
+    model.add_argument(
         "--tile",
         type=_tile,
         metavar="N",
@@ -327,7 +334,9 @@ def _pairs(
 
 def _metric(display: Display, options: argparse.Namespace) -> VDM:
     transform = TRANSFORMS[options.accuracy]()
-    metric = VDM(options.ppd, display, OBSERVERS[options.observer](), transform)
+    metric = VDM(
+        options.ppd, display, OBSERVERS[options.observer](), transform, effects=options.effects
+    )
     # A file says what its values are: codes beyond [0, 1] are colours that sRGB lacks.
     metric._range_is_known = True
     return metric
@@ -356,6 +365,7 @@ def _compare_with(
     start = time.perf_counter()
     jnd, pair = _largest(metric, pairs, tile, rooms)
     seconds = time.perf_counter() - start
+    plan = metric.plan(whole(pair.test), whole(pair.reference)) if tile is None else None
     luminances = pair.luminances()
     told = figures(jnd)
     assumptions = [seen_from, *assumptions]
@@ -371,6 +381,7 @@ def _compare_with(
         accuracy=options.accuracy,
         observer=options.observer,
         effects=metric.effects.names(),
+        left_out=[] if plan is None else plan.reasons(),
         seconds=seconds,
         assumptions=assumptions,
         version=__version__,
@@ -494,7 +505,8 @@ def _reproduce(reference: Path, test: Path, tile: int | None, options: argparse.
     words += ["--ppd", repr(options.ppd), "--peak", repr(options.peak)]
     words += ["--white", repr(options.white)]
     words += ["--exposure", repr(options.exposure), "--accuracy", options.accuracy]
-    words += ["--observer", options.observer, "--nonfinite", options.nonfinite]
+    words += ["--observer", options.observer, "--effects", options.effects]
+    words += ["--nonfinite", options.nonfinite]
     words += ["--negative", options.negative]
     if tile is not None:
         words += ["--tile", str(tile)]
@@ -523,6 +535,8 @@ def _text(
             "--observer calibrated does."
         )
     console.print()
+    for reason in comparison.left_out:
+        console.print(f"left out: {reason}", style="dim")
     for assumption in comparison.assumptions:
         console.print(f"assumed: {assumption}", style="dim")
     for path in (options.map, options.json):

@@ -48,7 +48,8 @@ class Comparison:
     JND figures are of the map: its maximum and where it is (x, y), mean and 95th percentile, and
     the share of pixels over 1 JND. ``score_jnd`` is that of `VDM.score`, the maximum again.
     ``mean_luminance_change`` is relative to the reference: -0.1 is 10 % darker; None against a
-    black reference. ``seconds`` is the metric's own time.
+    black reference. ``left_out``: what was not computed, and why it changes no figure.
+    ``seconds`` is the metric's own time.
     """
 
     max_jnd: float
@@ -64,6 +65,7 @@ class Comparison:
     accuracy: str
     observer: str
     effects: list[str]
+    left_out: list[str]
     seconds: float
     assumptions: list[str]
     version: str

@@ -1,14 +1,15 @@
 """The visual difference metric as a module: its options, and what it is asked for."""
 
 from collections.abc import Callable, Iterator
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torch_vdm.effects import Effects
-from torch_vdm.images import SQUARE, masked
+from torch_vdm.images import SQUARE as WHOLE_SQUARE
+from torch_vdm.images import can_be_read, masked
 from torch_vdm.model.cones import XYZ_TO_SML
 from torch_vdm.model.contrast import SML_TO_OPPONENTS
 from torch_vdm.model.cortex import DEEPEST, Cortex, Haar, Transform, bands
@@ -19,9 +20,11 @@ from torch_vdm.model.level import difference_of, gathered
 from torch_vdm.model.model import Model
 from torch_vdm.model.steps import Steps
 from torch_vdm.observer import Observer
+from torch_vdm.options import choice
 from torch_vdm.pair import Nonfinite, Numbers, PairMetric
+from torch_vdm.plan import Plan, everything, plan_of
 from torch_vdm.precision import computed_in
-from torch_vdm.run import strips, whole
+from torch_vdm.run import regions, strips, whole
 from torch_vdm.run.schedule import Schedule, chosen
 from torch_vdm.run.tiles import Done, Progress, in_tiles
 from torch_vdm.run.tiling import TILE, Source, check_sources, read
@@ -51,7 +54,8 @@ class VDM(PairMetric):
     transform
         How the image is decomposed: `Haar()`, the default, `StationaryHaar()` or `Steerable()`.
     effects
-        What is simulated; everything by default.
+        What is simulated. "auto", the default: everything, and what a pair does not call for is
+        not computed, see `plan`. "full": all of it is. Or an `Effects`.
     nonfinite
         "raise": NaN or infinity in an image is a ValueError that names the batch item (a graph
         of torch.export cannot raise: there it gives NaN). To know, one number an image is read
@@ -75,14 +79,13 @@ class VDM(PairMetric):
         display: Display | None = None,
         observer: Observer | None = None,
         transform: Transform | None = None,
-        effects: Effects | None = None,
+        effects: Effects | Literal["auto", "full"] | None = None,
         nonfinite: Nonfinite = "raise",
         schedule: Schedule | None = None,
     ) -> None:
         super().__init__(ppd, display, nonfinite)
         for name, option, kind in (
             ("observer", observer, Observer),
-            ("effects", effects, Effects),
             ("schedule", schedule, Schedule),
         ):
             if not isinstance(option, kind | None):
@@ -93,7 +96,12 @@ class VDM(PairMetric):
             )
         self.transform = transform or Haar()
         self.observer = (observer or Observer.calibrated()).fitted_to(self.transform)
-        self.effects = effects or Effects()
+        if not isinstance(effects, Effects | str | None):
+            raise ValueError(f'expected effects: "auto", "full" or Effects, got {effects!r}')
+        if isinstance(effects, str):
+            choice("effects", effects, ("auto", "full"))
+        self.effects = effects if isinstance(effects, Effects) else Effects()
+        self._planned = effects in ("auto", None)
         self.schedule = schedule
 
         peaks = [self.transform.peaks(level) for level in range(DEEPEST)]
@@ -133,12 +141,13 @@ class VDM(PairMetric):
         """Return the options."""
         return (
             f"ppd={self.ppd}, display={self.display}, observer={self.observer.name}, "
-            f"transform={self.transform}, effects={self.effects.names()}, "
+            f"transform={self.transform}, "
+            f"effects={'auto' if self._planned else self.effects.names()}, "
             f"schedule={self.schedule or 'chosen for each pair'}"
         )
 
-    def model(self, dtype: torch.dtype, steps: Steps | None = None) -> Model:
-        """Return what is computed, with constants of a precision; see `torch_vdm.model`."""
+    def model(self, dtype: torch.dtype, steps: Steps | None = None, grey: bool = False) -> Model:
+        """Return what is computed, with constants of a precision; see `torch_vdm.model.model`."""
         return Model(
             self.display,
             self.observer,
@@ -146,7 +155,26 @@ class VDM(PairMetric):
             self.effects,
             self._constants(dtype),
             self._schedule if steps is None else steps,
+            grey,
         )
+
+    def plan(self, test: Tensor, reference: Tensor) -> Plan:
+        """Return what is computed of a pair, (B, 3, H, W) twice, and what is left out, and why.
+
+        What is left out changes the map by rounding alone. It is planned where no gradient and no
+        compiled code is asked for, and where numbers can be read back, of which it takes a few.
+        """
+        test, reference, _ = self._checked(test, reference)
+        return self._plan(test, reference)
+
+    def _plan(self, test: Tensor, reference: Tensor) -> Plan:
+        names = tuple(self.effects.names())
+        job = self._job(test, reference)
+        reads = self.nonfinite == "raise" and can_be_read(test)
+        if not self._planned or job.gradients or job.compiles or job.traced or not reads:
+            return everything(names, len(test))
+        may = self.observer.charging and self.transform.csf == "levels"
+        return plan_of(test, reference, names, may)
 
     def scheduled(self, test: Tensor, reference: Tensor) -> Schedule:
         """Return how a pair, (B, 3, H, W) twice, is computed: what `repr` prints of it."""
@@ -159,8 +187,33 @@ class VDM(PairMetric):
         return self.schedule or Schedule(compiled=compiled)
 
     def _accumulated(self, test: Tensor, reference: Tensor) -> Tensor:
+        plan = self._plan(test, reference)
         schedule = self.scheduled(test, reference)
-        model = self.model(test.dtype, schedule)
+        model = self.model(test.dtype, schedule, plan.grey)
+        if not any(plan.equal) and not any(squares is not None for squares in plan.differing):
+            return self._executed(model, schedule, test, reference)
+        items = zip(test.split(1), reference.split(1), plan.differing, strict=True)
+        return torch.cat(
+            [
+                # An image's own power beside itself is 0 in every pixel.
+                model.nothing(one)
+                if same
+                else self._executed(model, schedule, one, other, some, plan.square)
+                for (one, other, some), same in zip(items, plan.equal, strict=True)
+            ]
+        )
+
+    def _executed(
+        self,
+        model: Model,
+        schedule: Schedule,
+        test: Tensor,
+        reference: Tensor,
+        differing: Tensor | None = None,
+        square: int = 1,
+    ) -> Tensor:
+        if differing is not None:
+            return regions.accumulated(model, schedule, test, reference, differing, square)
         if schedule.pieces == "strips":
             return strips.accumulated(model, schedule, test, reference)
         return whole.accumulated(model, schedule, test, reference)
@@ -323,7 +376,7 @@ class VDM(PairMetric):
         dtype = computed_in(*(read(source, 0, corner) for source in (test, reference)))
         schedule = self._schedule
         model = self.model(dtype, schedule)
-        square = SQUARE if self.nonfinite == "mask" else 1
+        square = WHOLE_SQUARE if self.nonfinite == "mask" else 1
         tiles = in_tiles(model, schedule, (test, reference), side, self._checked, square, progress)
         for done in tiles:
             yield done, masked(done.jnd(model), done.seen)[0, 0]

@@ -39,6 +39,11 @@ class Charge(NamedTuple):
     own: Tensor | None
     """Of its own local difference; None: all."""
 
+    def of(self, part: tuple[slice, slice]) -> "Charge":
+        """Return the same of some of the nodes, rows and columns."""
+        own = None if self.own is None else self.own[..., part[0], part[1]]
+        return Charge(self.inherited[..., part[0], part[1]], own)
+
 
 def changes(first: Tensor, second: Tensor) -> Tensor:
     """Return the squared difference of two lowpass planes (B, 3, h, w), (B, 1, h, w).

@@ -83,12 +83,14 @@ def weighted_contrast(
     pieces: Pieces,
     coarser: Tensor | None = None,
     finest: int = 0,
+    grey: Tensor | None = None,
     steps: Steps = PLAIN,
 ) -> Tensor:
     """Return the weighted contrast of A, C1, C2, 1 at threshold: (B, channels, H, W).
 
     Of cone planes (B, 3, H, W), from the scale ``finest`` on, to the coarsest or to that where
-    ``coarser`` is the sum of the rest.
+    ``coarser`` is the sum of the rest. ``grey``, (3,): of one plane (B, 1, H, W), and the cones'
+    are so many times it.
     """
     eye = constants["dark_cones"], constants["opponents"]
     of_light = {name: constants[name] for name in ("luminance_of_cones", "dark_light")}
@@ -102,14 +104,20 @@ def weighted_contrast(
         at_places = None if table is None else torch.cat((table[some], table[-1:]))
         own = Weights(weighting.passed[some].clone(), weighting.weights[:, some].clone(), at_places)
         contrast_of = partial(
-            _of_scale, finest=scale == 0, weighting=own, of_light=of_light, eye=eye, steps=steps
+            _of_scale,
+            finest=scale == 0,
+            weighting=own,
+            of_light=of_light,
+            eye=eye,
+            grey=grey,
+            steps=steps,
         )
         contrast, here = pieces(contrast_of, here)
         seen.append(contrast)
     if coarser is not None:
         seen.append(coarser)
     if not seen:  # one pixel
-        return 0.0 * planes[:, : len(constants["opponents"])]
+        return 0.0 * planes[:, :1].expand(-1, len(constants["opponents"]), -1, -1)
     return bands.gathered(seen, steps)
 
 
@@ -119,6 +127,7 @@ def _of_scale(
     weighting: Weights,
     of_light: dict[str, Tensor],
     eye: tuple[Tensor, Tensor],
+    grey: Tensor | None,
     steps: Steps,
 ) -> tuple[Tensor, Tensor]:
     """Return the weighted contrast of a scale's bands, and the lowpass that it leaves."""
@@ -126,9 +135,11 @@ def _of_scale(
     passed, weights_of_bands, table = weighting
     at_places = None
     if table is not None:
-        at_places = steps(band_sensitivity, lowpass, table, of_light)
+        light = lowpass if grey is None else lowpass * grey.view(3, 1, 1)
+        at_places = steps(band_sensitivity, light, table, of_light)
         at_places = bands.expanded(at_places, _size(around), steps)
-    seen: Tensor = steps(band_contrast, around, planes, passed, weights_of_bands, at_places, *eye)
+    of_bands = passed, weights_of_bands, at_places
+    seen: Tensor = steps(band_contrast, around, planes, *of_bands, *eye, grey)
     return seen, lowpass
 
 
@@ -158,19 +169,27 @@ def band_contrast(
     at_places: Tensor | None,
     dark_cones: Tensor,
     matrix: Tensor,
+    grey: Tensor | None = None,
 ) -> Tensor:
     """Return the weighted contrast (B, channels, h, w) of the n bands (B, 3, h, w) of a scale.
 
     ``around`` (B, 3, h, w) is what the eye is adapted to, ``passed`` (n, 3) what chromatic
     aberration leaves, ``weights_of_bands`` (channels, n), ``at_places`` (B, n + 1, h, w) what
-    multiplies those of A, and of C1 and C2, where they are local.
+    multiplies those of A, and of C1 and C2, where they are local. ``grey`` as in
+    `weighted_contrast`.
     """
-    adaptation = 1.0 / adapted(around, dark_cones)
+    light = around if grey is None else around * grey.view(3, 1, 1)
+    adaptation = 1.0 / adapted(light, dark_cones)
+    if grey is not None:
+        of_one = (adaptation * grey.view(3, 1, 1)).unbind(1)
     seen: list[Tensor] = []
     for number, band in enumerate(scale):
-        contrast = local_contrast(band.unsqueeze(2), adaptation).squeeze(2).unbind(1)
         mixing = matrix * passed[number] * weights_of_bands[:, number, None]
-        channels = [mix_row(row, contrast) for row in mixing]
+        if grey is None:
+            contrast = local_contrast(band.unsqueeze(2), adaptation).squeeze(2).unbind(1)
+            channels = [mix_row(row, contrast) for row in mixing]
+        else:
+            channels = [mix_row(row, of_one) * band[:, 0] for row in mixing]
         if at_places is not None:  # A's by themselves, for they follow the luminance band by band
             channels[0] = channels[0] * at_places[:, number]
         seen = [a + b for a, b in zip(seen, channels, strict=True)] if seen else channels

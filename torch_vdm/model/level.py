@@ -112,7 +112,8 @@ class Sight(NamedTuple):
 
     scale: Tensor | None
     """(B, 3, h, w): for each cone the share that chromatic aberration leaves, over what the
-    parent is adapted to. None where the details are weighted contrast already."""
+    parent is adapted to. None where the details are weighted contrast already, or those of one
+    plane, whose contrast in each channel the sensitivity has."""
     sensitivity: Tensor
     """(B, channels, orientations, h, w): the contrast sensitivity of each channel, or one
     orientation or node of it where all have the same."""
@@ -272,17 +273,25 @@ def sights_of(
     constants: Mapping[str, Tensor],
     local: bool,
     chromatic: bool,
+    grey: Tensor | None,
 ) -> list[Sight]:
     """Return the sight of a level at the parents of each image, fewer than its nodes.
 
-    ``parents`` are the lowpass of each, (B, 3, h, w); ``local``: in the local luminance.
+    ``parents`` are the lowpass of each, (B, 3, h, w); ``local``: in the local luminance. ``grey``,
+    (3,): the parents are one plane, and the cones' are so many times it.
     """
     sights = []
-    for parent in parents:
+    for plane in parents:
+        parent = plane if grey is None else plane * grey.view(3, 1, 1)
         scale = level.passed / adapted(parent, constants["dark_cones"])
         sensitivity = level.sensitivity.unsqueeze(0)
         if local:
             sensitivity = sensitivity_at(parent, level, constants, chromatic)
+        if grey is not None:
+            # Of one detail the three cones' contrasts, mixed, times the sensitivity.
+            mixed = mix(constants["opponents"], scale * grey.view(3, 1, 1)).unsqueeze(2)
+            sights.append(Sight(None, mixed * sensitivity))
+            continue
         sights.append(Sight(scale, sensitivity))
     return sights
 

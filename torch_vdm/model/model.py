@@ -58,6 +58,9 @@ class Model:
         Their numbers as tensors, in the precision of the computation and where it is done.
     steps
         How steps are called; one after the other by default.
+    grey
+        Whether the images' three channels are one, and one plane stands for the three cones. No
+        number changes but by rounding.
     """
 
     def __init__(
@@ -68,6 +71,7 @@ class Model:
         effects: Effects,
         constants: Mapping[str, Tensor],
         steps: Steps = PLAIN,
+        grey: bool = False,
     ) -> None:
         self.display = display
         self.observer = observer
@@ -75,6 +79,7 @@ class Model:
         self.effects = effects
         self.constants = constants
         self.steps = steps
+        self.grey = self._of_grey() if grey else None
 
     # Of one image.
 
@@ -84,14 +89,28 @@ class Model:
 
     def cone_planes(self, image: Tensor) -> Tensor:
         """Return the cone responses (B, 3, H, W) to an image: display, cone fundamentals."""
-        # From the display's primaries to cones at once: one mixing of all pixels instead of two.
-        matrix = self.constants["cones"]
-        if self.display.encoding != "xyz":
-            matrix = product(matrix, self.constants["primaries"]) * self.display.gain
         # Numbers as tensors: compiled code is specialised on others.
-        around = self.display.encoding, self.display.limit(image), matrix
-        planes: Tensor = self.steps.pixels(lambda part: self.steps(_light, part, *around), image)
-        return planes
+        around = self.display.encoding, self.display.limit(image)
+        if self.grey is not None:
+            one = image[:, :1]
+            return self.steps.pixels(lambda part: self.steps(linear_values, part, *around), one)
+        matrix = self._to_cones()
+        return self.steps.pixels(lambda part: self.steps(_light, part, *around, matrix), image)
+
+    def _to_cones(self) -> Tensor:
+        """Return the matrix from linear values to cones: one mixing of all pixels, not two."""
+        matrix = self.constants["cones"]
+        if self.display.encoding == "xyz":
+            return matrix
+        return product(matrix, self.constants["primaries"]) * self.display.gain
+
+    def _of_grey(self) -> Tensor:
+        """Return the cone responses (3,) to a linear value of 1 in all channels."""
+        return self._to_cones().sum(1)
+
+    def cones(self, planes: Tensor) -> Tensor:
+        """Return the three cones' planes (B, 3, h, w) of what is linear in `cone_planes`."""
+        return planes if self.grey is None else planes * self.grey.view(3, 1, 1)
 
     def decomposed(self, planes: Tensor) -> Cortex:
         """Return the cortex representation of cone planes (B, 3, H, W)."""
@@ -120,7 +139,7 @@ class Model:
         weights = self.band_weights()
         pieces = self.steps.strips
         return filtering.weighted_contrast(
-            planes, weights, self.constants, pieces, coarser, finest, self.steps
+            planes, weights, self.constants, pieces, coarser, finest, self.grey, self.steps
         )
 
     def band_weights(self) -> filtering.Weights:
@@ -171,13 +190,27 @@ class Model:
         images = details, others, sight, other_sight
         return local_difference(*images, self.options(), self.steps, first.items)
 
+    def nothing(self, image: Tensor) -> Tensor:
+        """Return `difference` of an image (1, 3, H, W) and itself."""
+        return image.new_zeros(1, 1, *self.leaves((image.shape[-2], image.shape[-1])))
+
+    def leaves(self, size: tuple[int, int]) -> tuple[int, int]:
+        """Return the sides of the plane of leaves: pixels, or nodes of 2 where none overlap.
+
+        An image of one pixel is its own node.
+        """
+        if self.transform.shifts > 1 or size == (1, 1):
+            return size
+        top, left = self.grid(size).before(0)
+        return -(-(size[0] + top) // 2), -(-(size[1] + left) // 2)
+
     def lowpass_difference(self, first: Cortex, second: Cortex) -> Tensor:
         """Return the weighted contrast between the means of two images, the lowpass term.
 
         (B, channels, 1, 1), not negative, 1 at threshold; 0 for an observer that never compares
         them. A uniform change is seen here and nowhere else.
         """
-        one, other = first.mean, second.mean
+        one, other = self.cones(first.mean), self.cones(second.mean)
         if self.observer.lowpass_gains is None:
             # Of the graph, so that an image of one pixel has a gradient.
             return 0.0 * one[:, :1] + 0.0 * other[:, :1]
@@ -259,12 +292,14 @@ class Model:
         sights: list[Sight] = self.steps(sights_of, parents, level, *self.sight_options())
         return sights
 
-    def sight_options(self) -> tuple[dict[str, Tensor], bool, bool]:
+    def sight_options(self) -> tuple[dict[str, Tensor], bool, bool, Tensor | None]:
         """Return what `sights_of` takes beside parents and level."""
         local = self.observer.adaptation_luminance is None
         # No more than it needs: a compiled function checks every tensor that it is given.
         names = ("dark_cones", *(OF_LUMINANCE if local else ()))
-        return {name: self.constants[name] for name in names}, local, self.effects.chromatic
+        names = names if self.grey is None else (*names, "opponents")
+        constants = {name: self.constants[name] for name in names}
+        return constants, local, self.effects.chromatic, self.grey
 
     def levels(self, finest: int, count: int) -> Levels:
         """Return what ``count`` levels respond to, from the level ``finest``; the coarsest first.

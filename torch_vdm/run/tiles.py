@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_vdm.model.charging import AROUND, Charge
+from torch_vdm.model.charging import AROUND
 from torch_vdm.model.cortex import Cortex, bands
 from torch_vdm.model.cortex.haar import lowpass_of_light
 from torch_vdm.model.cortex.transform import Base, mean_of
@@ -132,13 +132,7 @@ def in_tiles(
             local = list(map(cut, paths.local[fine], places))
             charges = model.charges(paths.changes[fine])
             if charges is not None:
-                charges = [
-                    Charge(
-                        cut(charge.inherited, place),
-                        None if charge.own is None else cut(charge.own, place),
-                    )
-                    for charge, place in zip(charges, places, strict=True)
-                ]
+                charges = [charge.of(place) for charge, place in zip(charges, places, strict=True)]
             total = cut(coarse, tile.of_image(2 ** (tiling.levels + 1) // shifts))
             seen = None if seen is None else cut(seen, around.pixels)
             before = part_grid.down(len(local))

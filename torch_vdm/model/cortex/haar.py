@@ -99,7 +99,7 @@ class Haar:
         self,
         planes: Tensor,
         octaves: int,
-        steps: Steps = PLAIN,
+        steps: Steps = PLAIN,  # noqa: ARG002  # as in `decompose`
         true_means: bool = False,
         *,
         grid: Grid | None = None,
@@ -108,7 +108,7 @@ class Haar:
         size = (planes.shape[-2], planes.shape[-1])
         if grid is None:
             grid = self.grid(size, true_means)
-        return [planes, *levels(planes, 0, size, steps, true_means, grid, octaves)[1]][octaves]
+        return [planes, *lowpasses(planes, 0, size, true_means, octaves, grid)][octaves]
 
     def resume(self, base: Base, steps: Steps = PLAIN, true_means: bool = False) -> Cortex:
         """Decompose the rest of an image; see `Transform.resume`."""
