@@ -23,11 +23,9 @@ MOST = 1e-4
 def small_squares(monkeypatch: pytest.MonkeyPatch) -> None:
     # Tiles and squares of large images, on small ones.
     for module, name, value in (
-        (plans, "SQUARE", 8),
         (plans, "SMALLEST", 1),
         (plans, "ROWS", 2),
-        (regions, "SIDE", 16),
-        (regions, "TOGETHER", 3),
+        (regions, "SMALLEST", 2),
     ):
         monkeypatch.setattr(module, name, value)
 

@@ -1,14 +1,12 @@
 """Images that are equal in most places: the finest levels where they differ alone.
 
-As in strips, but of tiles, and of those alone in whose surroundings the images differ: elsewhere
-nothing accumulates. Tiles that lie alike on their nodes are computed as one batch.
+As in strips, but of rectangles that together hold all places near which the images differ:
+elsewhere nothing accumulates.
 """
-
-from collections.abc import Iterator
-from itertools import groupby
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from torch_vdm.model.charging import AROUND
 from torch_vdm.model.cortex.transform import Base, mean_of
@@ -18,12 +16,15 @@ from torch_vdm.model.level import Levels
 from torch_vdm.model.model import Model
 from torch_vdm.precision import widest
 from torch_vdm.run.schedule import Schedule
-from torch_vdm.run.tiling import Tile, Tiling, cut
+from torch_vdm.run.tiling import Slices, Tile, Tiling, cut
 from torch_vdm.run.whole import differences, level_difference
 
-# Pixels a side of a tile, levels that are computed in tiles, from the finest, and tiles in a batch.
-# Status: choice, measured.
-SIDE, LEVELS, TOGETHER = 128, 2, 8
+# Levels that are computed in rectangles, from the finest. Status: choice, measured.
+LEVELS = 2
+
+# A rectangle is cut in two where less of it than this share is near a difference, down to so many
+# squares a side. Status: choice, measured.
+FULL, SMALLEST = 0.5, 8
 
 
 def accumulated(
@@ -46,25 +47,24 @@ def accumulated(
     options = schedule, model.observer.true_means
     grid, levels, octaves = model.grid(size), model.levels(0, count), count - shifts
     tiling = _tiling(size, shifts, transform.reach + AROUND * shifts, grid)
-    touched = [tile for tile in tiling if _touches(tile, differing, side)]
+    # Beyond pooling, filters and the parent, no level sees a difference, nor inherits one.
+    reach = -(-(transform.reach + 2 * shifts) // shifts) * 2**LEVELS
+    near = -(-reach // side)
+    touched = [_tile(box, side, tiling) for box in rectangles(_grown(differing, near))]
 
     light = model.cone_planes(reference)
     mean = mean_of(light)
     plane = transform.reduced(light, octaves, *options)
     changed, more = plane.clone(), torch.zeros_like(mean, dtype=widest(mean.device))
     fine: list[tuple[Tile, list[Tensor]]] = []
-    for tiles in _alike(tiling, touched):
-        first = model.cone_planes(torch.cat([cut(test, tile.around) for tile in tiles]))
-        second = torch.cat([cut(light, tile.around) for tile in tiles])
-        parts = _fine(model, schedule, first, second, levels, tiling.grid_of(tiles[0].around))
-        for number, tile in enumerate(tiles):
-            of_tile = [part[number : number + 1] for part in parts]
-            within = tile.within(1)
-            difference = cut(first - second, within)[number : number + 1].to(more)
-            more = more + difference.sum((-2, -1), keepdim=True)
-            rows, columns = tile.of_image(2**octaves)
-            changed[..., rows, columns] = cut(of_tile.pop(), tile.within(2**octaves))
-            fine.append((tile, of_tile))
+    for tile in touched:
+        first, second = model.cone_planes(cut(test, tile.around)), cut(light, tile.around)
+        parts = _fine(model, schedule, first, second, levels, tiling.grid_of(tile.around))
+        difference = cut(first - second, tile.within(1)).to(more)
+        more = more + difference.sum((-2, -1), keepdim=True)
+        rows, columns = tile.of_image(2**octaves)
+        changed[..., rows, columns] = cut(parts.pop(), tile.within(2**octaves))
+        fine.append((tile, parts))
     pixels = size[0] * size[1]
     means = mean + (more / pixels).to(mean), mean
     coarse = [
@@ -92,27 +92,57 @@ def accumulated(
 def _tiling(size: tuple[int, int], shifts: int, nodes: int, grid: Grid) -> Tiling:
     parent = 2 ** (LEVELS + 1)
     halo = -(-nodes // (2 * shifts)) * parent
-    return Tiling(size, (SIDE, SIDE), LEVELS, halo, grid)
+    # Cut by rectangles, and so never whole.
+    return Tiling(size, (0, 0), LEVELS, halo, grid)
 
 
-def _touches(tile: Tile, differing: Tensor, side: int) -> bool:
-    """Return whether the images differ in a tile or in what it is computed from."""
-    rows, columns = (slice(part.start // side, -(-part.stop // side)) for part in tile.around)
-    return bool(differing[rows, columns].any())
+def _grown(differing: Tensor, by: int) -> Tensor:
+    """Return squares and all up to so many beside them."""
+    some = differing[None, None].float()
+    return functional.max_pool2d(some, 2 * by + 1, 1, by)[0, 0] > 0.0
 
 
-def _alike(tiling: Tiling, tiles: list[Tile]) -> Iterator[list[Tile]]:
-    """Yield tiles of one size that lie alike on their nodes, a few at a time."""
+def rectangles(squares: Tensor) -> list[Slices]:
+    """Return rectangles apart from one another that hold all squares (rows, columns) of a plane."""
+    left, found = [(slice(0, squares.shape[0]), slice(0, squares.shape[1]))], []
+    some = squares.cpu()
+    while left:
+        box = left.pop()
+        inside = some[box]
+        places = [inside.any(1).nonzero().flatten(), inside.any(0).nonzero().flatten()]
+        if len(places[0]) == 0:
+            continue
+        rows, columns = (
+            slice(side.start + int(place[0]), side.start + int(place[-1]) + 1)
+            for side, place in zip(box, places, strict=True)
+        )
+        sides = rows.stop - rows.start, columns.stop - columns.start
+        full = float(some[rows, columns].float().mean()) >= FULL
+        if full or max(sides) <= SMALLEST:
+            found.append((rows, columns))
+        elif sides[0] >= sides[1]:
+            middle = rows.start + sides[0] // 2
+            left += [(slice(rows.start, middle), columns), (slice(middle, rows.stop), columns)]
+        else:
+            middle = columns.start + sides[1] // 2
+            left += [(rows, slice(columns.start, middle)), (rows, slice(middle, columns.stop))]
+    return found
 
-    def kind(tile: Tile) -> tuple[object, ...]:
-        around = [(side.stop - side.start) for side in tile.around]
-        return (*around, *tile.within(1), tiling.grid_of(tile.around))
 
-    ordered = sorted(tiles, key=lambda tile: repr(kind(tile)))
-    for _, group in groupby(ordered, key=lambda tile: repr(kind(tile))):
-        some = list(group)
-        for first in range(0, len(some), TOGETHER):
-            yield some[first : first + TOGETHER]
+def _tile(box: Slices, side: int, tiling: Tiling) -> Tile:
+    """Return a rectangle of squares as a tile, which begins and ends where parents do."""
+    parent = 2 ** (LEVELS + 1)
+    offsets = tiling.grid.offset(LEVELS + 1)
+
+    def snapped(part: slice, more: int, offset: int, length: int) -> slice:
+        first = (side * part.start - more + offset) // parent * parent - offset
+        last = -(-(side * part.stop + more + offset) // parent) * parent - offset
+        return slice(max(first, 0), min(last, length))
+
+    part, around = (
+        tuple(map(snapped, box, (more, more), offsets, tiling.size)) for more in (0, tiling.halo)
+    )
+    return Tile((part[0], part[1]), (around[0], around[1]), tiling.grid)
 
 
 def _fine(
