@@ -30,6 +30,9 @@ from torch_vdm.run.tiles import Done, Progress, in_tiles
 from torch_vdm.run.tiling import TILE, Source, check_sources, read
 from torch_vdm.sarnoff import Sarnoff
 
+# The exponent of the summation whose power of an energy is a cube: the calibrated observer's.
+CUBES = 6.0
+
 
 class VDM(PairMetric):
     """The visual difference metric of Bolin and Meyer 1999 as a module.
@@ -156,6 +159,7 @@ class VDM(PairMetric):
             self._constants(dtype),
             self._schedule if steps is None else steps,
             grey,
+            self.observer.summation_exponent == CUBES and self._is_own("summation_exponent"),
         )
 
     def plan(self, test: Tensor, reference: Tensor) -> Plan:

@@ -153,9 +153,15 @@ def decode_srgb(image: Tensor) -> Tensor:
     # The power never sees a base whose gradient is not finite. It is written in base 2, which is
     # the processor's own: twice as fast, and as exact. Both parts take the image itself, which a
     # backward pass has anyway.
-    base = (image.clamp(SRGB_KNEE, LARGEST_CODE) + SRGB_OFFSET) * (1.0 / (1.0 + SRGB_OFFSET))
-    power = torch.exp2(SRGB_EXPONENT * torch.log2(base))
-    straight = image.clamp_min(-LARGEST_CODE) * (1.0 / SRGB_SLOPE)
+    base = image.clamp(SRGB_KNEE, LARGEST_CODE)
+    straight = image.clamp_min(-LARGEST_CODE)
+    scale = 1.0 / (1.0 + SRGB_OFFSET)
+    if not (torch.is_grad_enabled() and image.requires_grad):
+        # The same in place: what a backward pass would need is overwritten.
+        power = base.add_(SRGB_OFFSET).mul_(scale).log2_().mul_(SRGB_EXPONENT).exp2_()
+        return torch.where(image <= SRGB_KNEE, straight.mul_(1.0 / SRGB_SLOPE), power)
+    power = torch.exp2(SRGB_EXPONENT * torch.log2((base + SRGB_OFFSET) * scale))
+    straight = straight * (1.0 / SRGB_SLOPE)
     return torch.where(image <= SRGB_KNEE, straight, power)
 
 

@@ -145,6 +145,8 @@ class Options(NamedTuple):
     """Whether nodes overlap, `Transform.shifts` of them in the width of one."""
     pooled: int
     """How many nodes in a row are pooled: 3, or 1."""
+    cubes: bool
+    """Whether the exponent of the summation is 6, and so that of energies 3."""
     matrix: Tensor
     """(channels, 3), of Eq. 3."""
     transducer_exponent: Tensor
@@ -212,7 +214,9 @@ def pooled_difference(around: Tensor, options: Options) -> Tensor:
     if options.signed and options.masking:
         left = unmasked(pooled[:, :, -1:] / count, options.transducer_exponent) + left
         pooled = pooled[:, :, :-1]
-    return local_visual_difference_of_energy(pooled, options.summation_exponent, left)
+    return local_visual_difference_of_energy(
+        pooled, options.summation_exponent, left, options.cubes
+    )
 
 
 def response(details: Tensor, sight: Sight, options: Options) -> Tensor:

@@ -61,6 +61,8 @@ class Model:
     grey
         Whether the images' three channels are one, and one plane stands for the three cones. No
         number changes but by rounding.
+    cubes
+        Whether the summation's exponent is 6, and no gradient by it is wanted.
     """
 
     def __init__(
@@ -72,6 +74,7 @@ class Model:
         constants: Mapping[str, Tensor],
         steps: Steps = PLAIN,
         grey: bool = False,
+        cubes: bool = False,
     ) -> None:
         self.display = display
         self.observer = observer
@@ -79,6 +82,7 @@ class Model:
         self.effects = effects
         self.constants = constants
         self.steps = steps
+        self.cubes = cubes
         self.grey = self._of_grey() if grey else None
 
     # Of one image.
@@ -279,6 +283,7 @@ class Model:
             self.transform.phases,
             self.transform.shifts > 1,
             3 if self.effects.pooling else 1,
+            self.cubes,
             self.constants["opponents"],
             self.constants["transducer_exponent"],
             self.constants["summation_exponent"],
