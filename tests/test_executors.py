@@ -163,5 +163,10 @@ def test_it_is_told() -> None:
     assert "schedule=chosen for each pair" in repr(VDM())
     assert "schedule=Schedule(pieces='strips'" in repr(VDM(schedule=Schedule("strips")))
     assert "few=0" in repr(VDMLoss(schedule=Schedule(few=0)))
+    # Too small to be cut.
+    images = torch.rand(2, 1, 3, 8, 5)
+    torch.testing.assert_close(VDM(schedule=Schedule("strips"))(*images), VDM()(*images))
+    with pytest.raises(ValueError, match="not stacked with Steerable"):
+        VDM(transform=Steerable(), schedule=Schedule(stacked=True))
     with pytest.raises(ValueError, match="expected schedule: Schedule, got 'strips'"):
         VDM(schedule="strips")  # type: ignore[arg-type]  # wrong on purpose

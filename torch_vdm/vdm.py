@@ -105,6 +105,11 @@ class VDM(PairMetric):
             choice("effects", effects, ("auto", "full"))
         self.effects = effects if isinstance(effects, Effects) else Effects()
         self._planned = effects in ("auto", None)
+        if schedule is not None and schedule.stacked and not self._stackable:
+            raise ValueError(
+                f"expected a schedule that is not stacked with {self.transform}, got one that is; "
+                "items lie below one another with Haar() alone"
+            )
         self.schedule = schedule
 
         peaks = [self.transform.peaks(level) for level in range(DEEPEST)]
@@ -165,8 +170,8 @@ class VDM(PairMetric):
     def plan(self, test: Tensor, reference: Tensor) -> Plan:
         """Return what is computed of a pair, (B, 3, H, W) twice, and what is left out, and why.
 
-        What is left out changes the map by rounding alone. It is planned where no gradient and no
-        compiled code is asked for, and where numbers can be read back, of which it takes a few.
+        What is left out changes the map by rounding alone. It is planned on the processor, where no
+        gradient and no compiled code is asked for, and where numbers may be read.
         """
         test, reference, _ = self._checked(test, reference)
         return self._plan(test, reference)
@@ -174,7 +179,7 @@ class VDM(PairMetric):
     def _plan(self, test: Tensor, reference: Tensor) -> Plan:
         names = tuple(self.effects.names())
         job = self._job(test, reference)
-        reads = self.nonfinite == "raise" and can_be_read(test)
+        reads = self.nonfinite == "raise" and test.device.type == "cpu" and can_be_read(test)
         if not self._planned or job.gradients or job.compiles or job.traced or not reads:
             return everything(names, len(test))
         may = self.observer.charging and self.transform.csf == "levels"
@@ -218,7 +223,7 @@ class VDM(PairMetric):
     ) -> Tensor:
         if differing is not None:
             return regions.accumulated(model, schedule, test, reference, differing, square)
-        if schedule.pieces == "strips":
+        if schedule.pieces == "strips" and strips.can_be_cut(test):
             return strips.accumulated(model, schedule, test, reference)
         return whole.accumulated(model, schedule, test, reference)
 
