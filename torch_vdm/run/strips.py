@@ -21,7 +21,7 @@ from torch_vdm.run.whole import differences, level_difference
 def can_be_cut(image: Tensor) -> bool:
     """Return whether an image (B, 3, H, W) has more levels than are computed in strips."""
     height, width = image.shape[-2:]
-    return max(height, width) > 2 ** (limits.STRIP_LEVELS + 1)
+    return max(height, width) > 1 << (limits.STRIP_LEVELS + 1)
 
 
 def accumulated(model: Model, schedule: Schedule, test: Tensor, reference: Tensor) -> Tensor:
