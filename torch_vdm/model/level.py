@@ -22,10 +22,12 @@ from torch_vdm.model.grid import NONE, Before
 from torch_vdm.model.masking import energy_transducer, masking_energy, unmasked
 from torch_vdm.model.matrix import mix
 from torch_vdm.model.pooling import (
+    POOLED,
     covering,
     phase_energy,
     pool,
     pool_halves,
+    pool_sums,
     surround,
     surround_halves,
     within,
@@ -202,14 +204,16 @@ def pooled_difference(around: Tensor, options: Options) -> Tensor:
 
     Printed responses are pooled as a difference, for pooling is linear; others come as squares.
     """
-    count = 1.0
+    if not options.energies:
+        pooled = pool(around) if options.pooled > 1 else around
+        return local_visual_difference(pooled, options.summation_exponent)
+    # Sums, which are divided where it costs least.
     if options.overlapping:
         pooled, count = pool_halves(around, options.pooled, -2), covering(options.pooled)
+    elif options.pooled > 1:
+        pooled, count = pool_sums(around), POOLED
     else:
-        pooled = pool(around) if options.pooled > 1 else around
-    if not options.energies:
-        return local_visual_difference(pooled, options.summation_exponent)
-    # The sums of overlapping nodes are divided where it costs least.
+        pooled, count = around, 1.0
     left: Tensor | float = -math.log2(count)
     if options.signed and options.masking:
         left = unmasked(pooled[:, :, -1:] / count, options.transducer_exponent) + left
