@@ -15,7 +15,7 @@ def comparison(**changes: object) -> Comparison:
         "max_jnd": 3.2, "max_pixel": (4, 5), "mean_jnd": 1.0, "p95_jnd": 2.0,
         "visible_fraction": 0.25, "score_jnd": 3.2, "mean_luminance_change": 0.0, "width": 8,
         "height": 9, "ppd": 60.0, "accuracy": "fast", "observer": "calibrated", "effects": [],
-        "seconds": 0.1, "assumptions": [], "version": "0", "reproduce": "",
+        "left_out": [], "seconds": 0.1, "assumptions": [], "version": "0", "reproduce": "",
     }  # fmt: skip
     return Comparison(**values | changes)  # type: ignore[arg-type]  # a dictionary for brevity
 

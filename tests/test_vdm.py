@@ -277,7 +277,7 @@ def test_wrong_images_are_refused(
         ({"ppd": 0.0}, "pixels per degree between 0.01 and 1e6, got 0"),
         ({"ppd": float("nan")}, "pixels per degree"),
         ({"observer": "paper"}, "observer: Observer, got 'paper'"),
-        ({"effects": "auto"}, "effects: Effects"),
+        ({"effects": "some"}, 'effects "auto" or "full"'),
         ({"nonfinite": "zero"}, '"raise" or "mask"'),
     ],
 )
@@ -408,7 +408,7 @@ def test_images_of_two_devices_are_refused() -> None:
         (lambda: untyped.VDM(transform="haar"), r"transform: Haar\(\).*, got 'haar'"),
         (lambda: untyped.VDM(transform=untyped.Observer.paper()), r"transform: Haar\(\)"),
         (lambda: untyped.VDM(observer=untyped.Observer.paper), "observer: Observer"),
-        (lambda: untyped.VDM(effects={"masking": False}), "effects: Effects"),
+        (lambda: untyped.VDM(effects={"masking": False}), '"full" or Effects'),
         (lambda: untyped.VDM(nonfinite=["mask"]), 'nonfinite "raise" or "mask"'),
         (lambda: untyped.VDM.sarnoff("60"), "pixels per degree: a number"),
         (lambda: untyped.VDM.sarnoff(resample="no"), "resample: True or False, got 'no'"),

@@ -14,8 +14,8 @@ SML_TO_OPPONENTS = (
 )
 
 # Contrasts are held to this: light cannot pass 4, but values below 0, which are no light, have no
-# bound, and their powers, and the slopes of these, would overflow. Status: choice.
-LARGEST = 1e6
+# bound, and their powers would overflow. Status: choice.
+LARGEST = 1e10
 
 
 def adapted(lowpass: Tensor, dark_light: Tensor) -> Tensor:

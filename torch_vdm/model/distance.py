@@ -53,9 +53,10 @@ def local_visual_difference_of_energy(
     """Return the local visual difference of squared differences: their power of exponent / 2.
 
     Arguments as `local_visual_difference`, whose square is the ``energy`` times 2^``left``.
-    ``cubes``: the exponent is 6, and two multiplications are its power.
+    ``cubes``: the exponent is 6, and where no gradient is wanted two multiplications are its power;
+    their slopes would overflow where values below 0 make differences that light has not.
     """
-    if cubes:
+    if cubes and not torch.is_grad_enabled():
         share = torch.exp2(left) if isinstance(left, Tensor) else 2.0**left
         seen = (energy * share).clamp_max(LARGEST_DIFFERENCE**2)
         return (seen * seen * seen).sum((1, 2)).unsqueeze(1)
