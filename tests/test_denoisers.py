@@ -89,7 +89,7 @@ def test_halves_tell_the_error_of_their_mean(tmp_path: Path) -> None:
     told = denoisers._own_error(tmp_path)["wall"]
     for name, value in told.items():
         # The largest of a noise scatters most.
-        within = 0.5 if name == "max_jnd" else 0.15
+        within = 0.5 if name == "max_jnd" else 0.25
         assert value == pytest.approx(known["figures"][name], rel=within), name
 
 
