@@ -48,23 +48,26 @@ def local_visual_difference(difference: Tensor, exponent: Tensor) -> Tensor:
 
 
 def local_visual_difference_of_energy(
-    energy: Tensor, exponent: Tensor, left: Tensor | float = 0.0, cubes: bool = False
+    energy: Tensor, exponent: Tensor, left: Tensor | float = 0.0
 ) -> Tensor:
     """Return the local visual difference of squared differences: their power of exponent / 2.
 
     Arguments as `local_visual_difference`, whose square is the ``energy`` times 2^``left``.
-    ``cubes``: the exponent is 6, and where no gradient is wanted two multiplications are its power;
-    their slopes would overflow where values below 0 make differences that light has not.
     """
-    if cubes and not torch.is_grad_enabled():
-        share = torch.exp2(left) if isinstance(left, Tensor) else 2.0**left
-        seen = (energy * share).clamp_max(LARGEST_DIFFERENCE**2)
-        return (seen * seen * seen).sum((1, 2)).unsqueeze(1)
     octaves = torch.log2(energy.clamp_min(SMALLEST_DIFFERENCE))
     held = (octaves + left).clamp_max(2.0 * math.log2(LARGEST_DIFFERENCE))
     # The energy times what is left of its power: exactly 0 at 0.
     power = energy * torch.exp2(0.5 * exponent * held - octaves)
     return power.sum((1, 2)).unsqueeze(1)
+
+
+def cubes(ratio: Tensor, factor: Tensor | float) -> Tensor:
+    """Return the same for an exponent of 6, of squared differences ``ratio`` times ``factor``.
+
+    Two multiplications are their power.
+    """
+    squared = (ratio * factor).clamp_max(LARGEST_DIFFERENCE**2)
+    return (squared * squared * squared).sum((1, 2)).unsqueeze(1)
 
 
 class Paths(NamedTuple):

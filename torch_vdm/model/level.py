@@ -17,7 +17,11 @@ from torch import Tensor
 
 from torch_vdm.model.contrast import adapted, local_contrast, opponents
 from torch_vdm.model.csf import bandpass
-from torch_vdm.model.distance import local_visual_difference, local_visual_difference_of_energy
+from torch_vdm.model.distance import (
+    cubes,
+    local_visual_difference,
+    local_visual_difference_of_energy,
+)
 from torch_vdm.model.grid import NONE, Before
 from torch_vdm.model.masking import energy_transducer, masking_energy, unmasked
 from torch_vdm.model.matrix import mix
@@ -214,13 +218,20 @@ def pooled_difference(around: Tensor, options: Options) -> Tensor:
         pooled, count = pool_sums(around), POOLED
     else:
         pooled, count = around, 1.0
+    masked = options.signed and options.masking
+    pooled, masks = (pooled[:, :, :-1], pooled[:, :, -1:] / count) if masked else (pooled, None)
+    if options.cubes:
+        if masks is None:
+            return cubes(pooled, 1.0 / count)
+        # What masks is no less than half of what differs: no slope of their ratio overflows, nor of
+        # what is left, where values below 0 make differences that light has not.
+        base = masks + 1.0
+        octaves = unmasked(masks, options.transducer_exponent) + torch.log2(base)
+        return cubes(pooled / base, torch.exp2(octaves - math.log2(count)))
     left: Tensor | float = -math.log2(count)
-    if options.signed and options.masking:
-        left = unmasked(pooled[:, :, -1:] / count, options.transducer_exponent) + left
-        pooled = pooled[:, :, :-1]
-    return local_visual_difference_of_energy(
-        pooled, options.summation_exponent, left, options.cubes
-    )
+    if masks is not None:
+        left = unmasked(masks, options.transducer_exponent) + left
+    return local_visual_difference_of_energy(pooled, options.summation_exponent, left)
 
 
 def response(details: Tensor, sight: Sight, options: Options) -> Tensor:
