@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from benchmarks import record
-from benchmarks.pictures import distorted, photographs, renders
+from benchmarks.pictures import distorted, grainy, photographs, renders
 from torch_vdm import VDM, Effects
-from torch_vdm.model.display import decode_srgb, encode_srgb
 
 THREADS = 2
 
@@ -65,10 +64,10 @@ def pairs(size: tuple[int, int]) -> dict[str, Pair]:
     generator = torch.Generator().manual_seed(1)
     ours = drawn(size)
     grey = ours.mean(1, keepdim=True).expand(-1, 3, -1, -1).contiguous()
-    grain = 1.0 + 0.15 * torch.randn(grey[:, :1].shape, generator=generator)
+    normal = torch.randn(grey[:, :1].shape, generator=generator)
     tests = distorted(ours, generator)
     found = {
-        "grey": Pair(encode_srgb(decode_srgb(grey) * grain).clamp(0.0, 1.0), grey),
+        "grey": Pair(grainy(grey, normal).clamp(0.0, 1.0), grey),
         "local edits": Pair(_edited(ours), ours),
         "one pixel": Pair(_edited(ours, 1), ours),
         "equal": Pair(ours.clone(), ours),
@@ -77,8 +76,7 @@ def pairs(size: tuple[int, int]) -> dict[str, Pair]:
     }
     for name, photo in photographs(1).items():
         whole = filled(photo, size)
-        grain = 1.0 + 0.15 * torch.randn(whole.shape, generator=generator)
-        test = encode_srgb(decode_srgb(whole) * grain)
+        test = grainy(whole, torch.randn(whole.shape, generator=generator))
         found[f"photograph {name}, noise"] = Pair(test.clamp(0.0, 1.0), whole)
         render = next(renders(), None)
         if render is not None:

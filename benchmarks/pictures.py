@@ -50,14 +50,14 @@ def distorted(photo: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
     noise = torch.randn(photo.shape, generator=generator)
     box = torch.full((3, 1, 3, 3), 1.0 / 9.0)
     blurred = functional.conv2d(functional.pad(photo, (1,) * 4, "replicate"), box, groups=3)
-    grain = 1.0 + GRAIN * torch.randn(photo[:, :1].shape, generator=generator)
+    normal = torch.randn(photo[:, :1].shape, generator=generator)
     patches = torch.randn(1, 3, -(-height // PATCH), -(-width // PATCH), generator=generator)
     residue = functional.interpolate(patches, scale_factor=PATCH, mode="bilinear")
     cast = torch.tensor([1.0 + CAST, 1.0, 1.0 - CAST]).view(1, 3, 1, 1)
     sparse = functional.interpolate(photo[..., ::2, ::2], scale_factor=2.0, mode="nearest")
     tests = {
         "noise": photo + NOISE * noise,
-        "grain": encode_srgb(decode_srgb(photo) * grain),
+        "grain": grainy(photo, normal),
         "residue": photo + RESIDUE * residue[..., :height, :width],
         "blur": blurred,
         "half of blur": 0.5 * (photo + blurred),
@@ -70,6 +70,11 @@ def distorted(photo: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
         "grating": photo + WAVE * torch.sin(2.0 * math.pi * (x / 8.0 + y / 19.0)),
     }
     return {kind: test.clamp(0.0, 1.0) for kind, test in tests.items()}
+
+
+def grainy(photo: Tensor, normal: Tensor) -> Tensor:
+    """Return a picture with noise that rises with its light, from normal numbers."""
+    return encode_srgb(decode_srgb(photo) * (1.0 + GRAIN * normal))
 
 
 def jpeg(photo: Tensor, quality: int) -> Tensor:

@@ -14,6 +14,14 @@ XYZ_TO_SML = (
 )
 
 
+def of_grey(plane: Tensor, grey: Tensor | None) -> Tensor:
+    """Return the cones' planes (B, 3, h, w) of one that stands for them, ``grey`` (3,) times it.
+
+    Without ``grey`` the plane, which then has three channels, as it is.
+    """
+    return plane if grey is None else plane * grey.view(3, 1, 1)
+
+
 def cone_responses(xyz: Tensor, matrix: Tensor) -> Tensor:
     """Return the S, M, L responses to absolute CIE XYZ (Eq. 1).
 

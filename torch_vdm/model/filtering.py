@@ -6,13 +6,14 @@ For transforms with ``csf="filter"``, whose levels then only divide by their gai
 """
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torch_vdm.model.cones import of_grey
 from torch_vdm.model.contrast import adapted, local_contrast
 from torch_vdm.model.cortex import bands
 from torch_vdm.model.level import Level, adapted_luminance, sensitivity_at
@@ -22,9 +23,6 @@ from torch_vdm.model.steps import PLAIN, Steps
 # Where the weights of the bands are worked out, log2 cd/m2, and between them interpolated:
 # sensitivities change by less than 3 dB from one to the next. Status: choice.
 LUMINANCES = tuple(range(-8, 18))
-
-# Applies a function of a plane, which may be given in strips, with so many rows around each.
-Pieces = Callable[[Callable[[Tensor], tuple[Tensor, Tensor]], Tensor], tuple[Tensor, Tensor]]
 
 
 class Weights(NamedTuple):
@@ -80,7 +78,6 @@ def weighted_contrast(
     planes: Tensor,
     weighting: Weights,
     constants: Mapping[str, Tensor],
-    pieces: Pieces,
     coarser: Tensor | None = None,
     finest: int = 0,
     grey: Tensor | None = None,
@@ -112,7 +109,7 @@ def weighted_contrast(
             grey=grey,
             steps=steps,
         )
-        contrast, here = pieces(contrast_of, here)
+        contrast, here = steps.strips(contrast_of, here)
         seen.append(contrast)
     if coarser is not None:
         seen.append(coarser)
@@ -135,8 +132,7 @@ def _of_scale(
     passed, weights_of_bands, table = weighting
     at_places = None
     if table is not None:
-        light = lowpass if grey is None else lowpass * grey.view(3, 1, 1)
-        at_places = steps(band_sensitivity, light, table, of_light)
+        at_places = steps(band_sensitivity, of_grey(lowpass, grey), table, of_light)
         at_places = bands.expanded(at_places, _size(around), steps)
     of_bands = passed, weights_of_bands, at_places
     seen: Tensor = steps(band_contrast, around, planes, *of_bands, *eye, grey)
@@ -178,10 +174,8 @@ def band_contrast(
     multiplies those of A, and of C1 and C2, where they are local. ``grey`` as in
     `weighted_contrast`.
     """
-    light = around if grey is None else around * grey.view(3, 1, 1)
-    adaptation = 1.0 / adapted(light, dark_cones)
-    if grey is not None:
-        of_one = (adaptation * grey.view(3, 1, 1)).unbind(1)
+    adaptation = 1.0 / adapted(of_grey(around, grey), dark_cones)
+    of_one = of_grey(adaptation, grey).unbind(1)
     seen: list[Tensor] = []
     for number, band in enumerate(scale):
         mixing = matrix * passed[number] * weights_of_bands[:, number, None]

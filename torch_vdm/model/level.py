@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torch_vdm.model.cones import of_grey
 from torch_vdm.model.contrast import adapted, local_contrast, opponents
 from torch_vdm.model.csf import bandpass
 from torch_vdm.model.distance import (
@@ -301,14 +302,14 @@ def sights_of(
     """
     sights = []
     for plane in parents:
-        parent = plane if grey is None else plane * grey.view(3, 1, 1)
+        parent = of_grey(plane, grey)
         scale = level.passed / adapted(parent, constants["dark_cones"])
         sensitivity = level.sensitivity.unsqueeze(0)
         if local:
             sensitivity = sensitivity_at(parent, level, constants, chromatic)
         if grey is not None:
             # Of one detail the three cones' contrasts, mixed, times the sensitivity.
-            mixed = mix(constants["opponents"], scale * grey.view(3, 1, 1)).unsqueeze(2)
+            mixed = mix(constants["opponents"], of_grey(scale, grey)).unsqueeze(2)
             sights.append(Sight(None, mixed * sensitivity))
             continue
         sights.append(Sight(scale, sensitivity))

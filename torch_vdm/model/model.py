@@ -19,7 +19,7 @@ from torch_vdm.effects import Effects
 from torch_vdm.model import filtering
 from torch_vdm.model.aberration import attenuation
 from torch_vdm.model.charging import Charge, changes, charge
-from torch_vdm.model.cones import cone_responses
+from torch_vdm.model.cones import cone_responses, of_grey
 from torch_vdm.model.contrast import opponents, weber_contrast
 from torch_vdm.model.cortex import Cortex, Transform
 from torch_vdm.model.cortex.haar import lowpass_of_light
@@ -114,7 +114,7 @@ class Model:
 
     def cones(self, planes: Tensor) -> Tensor:
         """Return the three cones' planes (B, 3, h, w) of what is linear in `cone_planes`."""
-        return planes if self.grey is None else planes * self.grey.view(3, 1, 1)
+        return of_grey(planes, self.grey)
 
     def decomposed(self, planes: Tensor) -> Cortex:
         """Return the cortex representation of cone planes (B, 3, H, W)."""
@@ -140,10 +140,8 @@ class Model:
         """
         if self.transform.csf == "levels":
             return planes
-        weights = self.band_weights()
-        pieces = self.steps.strips
         return filtering.weighted_contrast(
-            planes, weights, self.constants, pieces, coarser, finest, self.grey, self.steps
+            planes, self.band_weights(), self.constants, coarser, finest, self.grey, self.steps
         )
 
     def band_weights(self) -> filtering.Weights:

@@ -10,12 +10,12 @@ from torch.nn import functional
 
 from torch_vdm.model.charging import AROUND
 from torch_vdm.model.cortex.transform import Base, mean_of
-from torch_vdm.model.distance import accumulate
 from torch_vdm.model.grid import Grid
 from torch_vdm.model.level import Levels
 from torch_vdm.model.model import Model
 from torch_vdm.precision import widest
 from torch_vdm.run.schedule import Schedule
+from torch_vdm.run.tiles import within_tile
 from torch_vdm.run.tiling import Slices, Tile, Tiling, cut
 from torch_vdm.run.whole import differences, level_difference
 
@@ -74,16 +74,7 @@ def accumulated(
     above = model.descended(differences(model, schedule, *coarse), coarse[0].before)
     total = above.new_zeros(1, 1, *model.leaves(size))
     for tile, parts in fine:
-        places = [tile.within(2 ** (level + 1) // shifts) for level in range(LEVELS)][::-1]
-        local, changes = parts[::2], parts[1::2]
-        charges = model.charges(changes)
-        assert charges is not None
-        part = accumulate(
-            list(map(cut, local, places)),
-            cut(above, tile.of_image(2 ** (LEVELS + 1) // shifts)),
-            before=tiling.grid_of(tile.part).down(LEVELS),
-            charges=[charge.of(place) for charge, place in zip(charges, places, strict=True)],
-        )
+        part = within_tile(model, tiling, tile, parts[::2], parts[1::2], above)
         rows, columns = tile.of_image(2 // shifts)
         total[..., rows, columns] = part
     return total

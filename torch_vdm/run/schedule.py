@@ -115,7 +115,6 @@ def chosen(job: Job) -> Schedule:
         stacked=compiles and job.items > 1 and job.stackable,
         compiled=compiles,
         again=job.checkpoints and job.gradients and not job.traced,
-        few=FEW_NODES,
     )
 
 

@@ -7,7 +7,7 @@ that the tiles leave, no larger than one of them.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import count
 from typing import NamedTuple
@@ -125,20 +125,37 @@ def in_tiles(
                 yield Done(item, tile.part, part_grid, total, seen)
                 step()
                 continue
-            places = [tile.within(2 ** (level + 1) // shifts) for level in range(tiling.levels)][
-                ::-1
-            ]
             fine = slice(-tiling.levels, None)
-            local = list(map(cut, paths.local[fine], places))
-            charges = model.charges(paths.changes[fine])
-            if charges is not None:
-                charges = [charge.of(place) for charge, place in zip(charges, places, strict=True)]
-            total = cut(coarse, tile.of_image(2 ** (tiling.levels + 1) // shifts))
+            total = within_tile(model, tiling, tile, paths.local[fine], paths.changes[fine], coarse)
             seen = None if seen is None else cut(seen, around.pixels)
-            before = part_grid.down(len(local))
-            total = accumulate(local, total, before=before, charges=charges)
             yield Done(item, tile.part, part_grid, total, seen)
             step()
+
+
+def within_tile(
+    model: Model,
+    tiling: Tiling,
+    tile: Tile,
+    local: Sequence[Tensor],
+    changes: Sequence[Tensor],
+    coarse: Tensor,
+) -> Tensor:
+    """Return what accumulates down the paths to the leaves of a tile, (1, 1, h, w).
+
+    ``local`` and ``changes`` are of the tile's levels, the coarsest first, with what is around it;
+    ``coarse`` is what has accumulated above these levels, of the whole image.
+    """
+    shifts = model.transform.shifts
+    places = [tile.within(2 ** (level + 1) // shifts) for level in range(tiling.levels)][::-1]
+    charges = model.charges(changes)
+    if charges is not None:
+        charges = [charge.of(place) for charge, place in zip(charges, places, strict=True)]
+    return accumulate(
+        list(map(cut, local, places)),
+        cut(coarse, tile.of_image(2 ** (tiling.levels + 1) // shifts)),
+        before=tiling.grid_of(tile.part).down(tiling.levels),
+        charges=charges,
+    )
 
 
 def _decomposed(
