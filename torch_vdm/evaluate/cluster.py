@@ -8,7 +8,7 @@ import pickle
 import sys
 import threading
 import time
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from itertools import islice
@@ -22,7 +22,7 @@ from torch_vdm.evaluate import journal
 from torch_vdm.evaluate.frames import EvaluationError, Job
 from torch_vdm.evaluate.journal import Result
 from torch_vdm.evaluate.judge import Judge
-from torch_vdm.evaluate.workers import no_interrupts
+from torch_vdm.evaluate.workers import Known, no_interrupts
 from torch_vdm.io import ImageError
 from torch_vdm.io.refusal import printable
 
@@ -36,8 +36,6 @@ FEWEST_IN_HAND, IN_HAND_PER_THREAD = 256, 4
 
 # Seconds for which the number of threads of the cluster is believed. Status: choice.
 BELIEVED = 5.0
-
-Known = Mapping[tuple[str, str], Result]
 
 
 class Sent(NamedTuple):
