@@ -15,6 +15,8 @@ BENCHMARKS = {
     "effects": "what each effect costs, and what leaving it out shows; 5 minutes, 10 seconds with "
     "--quick",
     "large": "memory on images up to 16,384 x 16,384; 15 minutes, 15 seconds with --quick",
+    "launches": "how many operations a map is, which a GPU waits for; 1 minute, 5 seconds with "
+    "--quick",
     "oracle": "the fewest samples that placement could need; 15 minutes, 10 seconds with --quick",
     "overhead": "what deciding costs beside rendering; 10 minutes, 10 seconds with --quick",
     "paper": "Figures 9 to 14, and real scenes; 2 hours, 30 seconds with --quick",

@@ -1,5 +1,6 @@
 """The law of executors: each gives what the model gives, step by step."""
 
+import dataclasses
 from collections.abc import Callable
 
 import pytest
@@ -12,14 +13,17 @@ from torch_vdm.model.model import Model
 from torch_vdm.model.steps import PLAIN
 from torch_vdm.run import schedule as limits
 from torch_vdm.run import strips, whole
-from torch_vdm.run.schedule import Job, Schedule, chosen
+from torch_vdm.run.schedule import EVERY_LEVEL, Job, Schedule, chosen
 
 TRANSFORMS = [Haar(), Haar("filter"), StationaryHaar(), StationaryHaar("filter"), Steerable()]
 
 # The default, and others that a pair may get; each with the route that is to be taken.
+ACCELERATED = Schedule(together=True, cached=False, few=EVERY_LEVEL)
 SCHEDULES = {
     "coarse levels at once": Schedule(few=64),
     "levels one by one": Schedule(few=0),
+    "both images together": Schedule(together=True, few=64),
+    "a GPU's": ACCELERATED,
     "strips": Schedule("strips", few=64),
     "computed again": Schedule("strips", again=True, few=16),
     "stacked": Schedule(stacked=True, few=64),
@@ -128,7 +132,7 @@ def test_tiles_too(transform: Transform) -> None:
     torch.testing.assert_close(metric.tiled(*images, tile=48), plain, rtol=1e-7, atol=1e-9)
 
 
-JOB = Job(1, (100, 100), True, False, False, False, False)
+JOB = Job(1, (400, 400), True, False, False, False, False, False, False)
 
 
 @pytest.mark.parametrize(
@@ -136,6 +140,11 @@ JOB = Job(1, (100, 100), True, False, False, False, False)
     [
         ({}, {}),
         ({"size": (1080, 1920)}, {"pieces": "strips"}),
+        # Of small images an operation costs more than its numbers.
+        ({"size": (64, 64)}, {"together": True}),
+        ({"size": (64, 64), "gradients": True}, {"together": True}),
+        ({"size": (64, 64), "gradients": True, "one_sided": True}, {}),
+        ({"size": (64, 64), "compiles": True}, {"compiled": True}),
         # Strips keep more for a backward pass than whole planes, unless they are computed again.
         ({"size": (1080, 1920), "gradients": True}, {}),
         (
@@ -145,6 +154,12 @@ JOB = Job(1, (100, 100), True, False, False, False, False)
         ({"items": 4}, {}),
         ({"items": 4, "compiles": True}, {"compiled": True, "stacked": True}),
         ({"items": 4, "compiles": True, "stackable": False}, {"compiled": True}),
+        # On a GPU few operations, of all that there is.
+        ({"accelerated": True, "size": (1080, 1920)}, dataclasses.asdict(ACCELERATED)),
+        (
+            {"accelerated": True, "gradients": True, "one_sided": True},
+            dataclasses.asdict(ACCELERATED) | {"together": False},
+        ),
         # A graph that somebody else makes has all of it, in one piece.
         ({"size": (1080, 1920), "compiles": True, "traced": True}, {}),
     ],
@@ -159,7 +174,7 @@ def test_a_schedule_is_chosen_for_the_job(
 
 def test_it_is_told() -> None:
     images = torch.rand(2, 2, 3, 8, 8)
-    assert VDM().scheduled(*images) == Schedule()
+    assert VDM().scheduled(*images) == Schedule(together=True)
     assert "schedule=chosen for each pair" in repr(VDM())
     assert "schedule=Schedule(pieces='strips'" in repr(VDM(schedule=Schedule("strips")))
     assert "few=0" in repr(VDMLoss(schedule=Schedule(few=0)))

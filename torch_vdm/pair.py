@@ -101,13 +101,16 @@ class PairMetric(operators.Enrolled):
 
     def _job(self, test: Tensor, reference: Tensor) -> Job:
         """Return what decides how two batches are compared."""
+        gradients = torch.is_grad_enabled()
         return Job(
             len(test),
             (test.shape[-2], test.shape[-1]),
             self._stackable,
-            torch.is_grad_enabled() and (test.requires_grad or reference.requires_grad),
+            gradients and (test.requires_grad or reference.requires_grad),
+            gradients and test.requires_grad != reference.requires_grad,
             self._compiles,
             self._checkpointed,
+            test.device.type not in ("cpu", "meta"),
             torch.compiler.is_compiling(),
         )
 

@@ -115,7 +115,7 @@ def accumulate(
             total = nodes + total
             continue
         inherited, own = charges[level]
-        total = (nodes if own is None else nodes * own) + total * inherited
+        total = torch.addcmul(nodes if own is None else nodes * own, total, inherited)
     return total
 
 

@@ -7,11 +7,10 @@ pixels at 1920 x 1080. Where a `Grid` puts a node before the first, it is ceil((
 parent of x is (x + 1) // 2. Several trees may lie below one another in one plane.
 """
 
-import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.model.grid import NONE, Before, Side
+from torch_vdm.model.grid import NONE, Before
 from torch_vdm.model.interleave import interleaved
 
 # Planes with no more numbers are enlarged by torch's own operation, which is faster for them.
@@ -25,113 +24,6 @@ def pad_even(plane: Tensor) -> Tensor:
     if height % 2 == 0 and width % 2 == 0:
         return plane
     return functional.pad(plane, (0, width % 2, 0, height % 2), mode="replicate")
-
-
-def complete(plane: Tensor, sides: tuple[Side, Side]) -> Tensor:
-    """Pad ``plane`` to even sides so that no pixel weighs more than another in the details.
-
-    ``plane`` (B, C, h, w) holds the means of nodes, which lie as ``sides`` say. The last row or
-    column R may hold only the share r of its pixels: it becomes L + r (R - L), as if the pixels
-    that it lacks were like L, the one before it. Where it has no sibling it gets L for one, so that
-    its details are those of a window over the border. The first row and column likewise. Where two
-    nodes are all that there is, they keep the mean of their pixels and differ by the smaller share.
-    The lowpass then is not that of the nodes' own pixels; see `own`.
-    """
-    for side, axis in zip(sides, (-2, -1), strict=True):
-        plane = _weakened(plane, axis, side)
-        nodes = plane.shape[axis]
-        if nodes == 1:
-            continue
-        # What has no sibling gets the node beside it for one.
-        front = plane.narrow(axis, 1, 1) if side.before == 1 else None
-        odd = (nodes + side.before) % 2 == 1
-        plane = _joined(front, plane, plane.narrow(axis, nodes - 2, 1) if odd else None, axis)
-    return pad_even(plane)
-
-
-def _weakened(plane: Tensor, axis: int, side: Side) -> Tensor:
-    """Return a plane whose first and last node along an axis count for the pixels they have."""
-    nodes = plane.shape[axis]
-    if nodes == 1 or side.first == side.last == 1.0:
-        return plane
-    first, last = plane.narrow(axis, 0, 1), plane.narrow(axis, nodes - 1, 1)
-    if nodes == 2:
-        between, half = last - first, 0.5 * min(side.first, side.last)
-        down, up = (share / (side.first + side.last) - half for share in (side.last, side.first))
-        return torch.cat((first + down * between, last - up * between), axis)
-    if side.first < 1.0:
-        beside = plane.narrow(axis, 1, 1)
-        first = beside + side.first * (first - beside)
-    if side.last < 1.0:
-        beside = plane.narrow(axis, nodes - 2, 1)
-        last = beside + side.last * (last - beside)
-    return torch.cat((first, plane.narrow(axis, 1, nodes - 2), last), axis)
-
-
-def own(lowpass: Tensor, plane: Tensor, sides: tuple[Side, Side]) -> Tensor:
-    """Give the border nodes the mean of their own pixels.
-
-    ``lowpass`` (B, C, h / 2, w / 2) is that of Eq. 2 from a `complete` ``plane``, which is given
-    as it was before, (B, C, h, w); ``sides`` as there.
-    """
-    for axis, other in ((-1, -2), (-2, -1)):
-        first, last = (
-            None if end is None else _means(end, other, sides[other])
-            for end in _ends(plane, axis, sides[axis])
-        )
-        begin, given = (0 if first is None else 1), sum(end is not None for end in (first, last))
-        inner = lowpass.narrow(axis, begin, lowpass.shape[axis] - given) if given else lowpass
-        lowpass = _joined(first, inner, last, axis)
-    return lowpass
-
-
-def _means(plane: Tensor, axis: int, side: Side) -> Tensor:
-    """Return the means of the pixels of every parent along an axis."""
-    nodes = plane.shape[axis]
-    if nodes == 1:
-        return plane
-    first, last = _ends(plane, axis, side)
-    begin = 0 if first is None else 2 - side.before
-    end = nodes if last is None else nodes - 2 + (nodes + side.before) % 2
-    pairs = plane.narrow(axis, begin, end - begin)
-    if axis == -1:
-        one, two = pairs[..., 0::2], pairs[..., 1::2]
-    else:
-        one, two = pairs[..., 0::2, :], pairs[..., 1::2, :]
-    return _joined(first, 0.5 * (one + two), last, axis)
-
-
-def _ends(plane: Tensor, axis: int, side: Side) -> tuple[Tensor | None, Tensor | None]:
-    """Return the means of the pixels of the first and the last parent along an axis.
-
-    None where that is the mean of two nodes; of a parent that is alone as the last.
-    """
-    nodes = plane.shape[axis]
-    if nodes == 1:
-        return None, None
-    far = plane.narrow(axis, 0, 1), plane.narrow(axis, 1, 1)
-    near = plane.narrow(axis, nodes - 2, 1), plane.narrow(axis, nodes - 1, 1)
-    if nodes == 2 and side.before == 0:
-        return None, _mean(*near, side.first, side.last)
-    first = far[0] if side.before == 1 else _mean(*far, side.first, 1.0)
-    last = near[1] if (nodes + side.before) % 2 == 1 else _mean(*near, 1.0, side.last)
-    return first, last
-
-
-def _mean(one: Tensor, two: Tensor, first: float, last: float) -> Tensor | None:
-    """Return the mean of two nodes that have these shares of their pixels; None of whole ones."""
-    if first == last == 1.0:
-        return None
-    if first == 1.0:
-        return (one + last * two) / (1.0 + last)
-    # Exactly their own where they are equal.
-    return two + first / (first + last) * (one - two)
-
-
-def _joined(first: Tensor | None, plane: Tensor, last: Tensor | None, axis: int) -> Tensor:
-    """Return a plane with a row or column before and after it, where they are given."""
-    given = [part for part in (first, plane, last) if part is not None]
-    return torch.cat(given, axis) if len(given) > 1 else plane
 
 
 def stacked(batch: Tensor) -> Tensor:

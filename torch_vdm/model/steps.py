@@ -9,6 +9,16 @@ from torch import Tensor
 class Steps:
     """Calls the steps of the model one after the other, each as it is; executors derive others."""
 
+    @property
+    def fused(self) -> bool:
+        """Whether the operations of a step become one, and a step for special cases costs more."""
+        return False
+
+    @property
+    def in_cache(self) -> bool:
+        """Whether large planes are computed in more and smaller operations than they need."""
+        return False
+
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return what a pure function of planes returns; the first plane tells how large it is."""
         return function(*arguments)

@@ -28,6 +28,7 @@ BAND_STRIP = 2**17
 # Levels of at most as many nodes are computed at once: there an operation costs more than the
 # numbers that it works on. Status: choice, measured.
 FEW_NODES = 64 * 64
+EVERY_LEVEL = 2**62
 
 
 class Job(NamedTuple):
@@ -39,10 +40,14 @@ class Job(NamedTuple):
     """Whether items may lie below one another: with `Haar` alone."""
     gradients: bool
     """Whether a backward pass may follow."""
+    one_sided: bool
+    """Whether one of the images alone has a gradient."""
     compiles: bool
     """Whether the compiled route was asked for."""
     checkpoints: bool
     """Whether little is to be kept for the backward pass."""
+    accelerated: bool
+    """Whether it is done on a GPU or the like."""
     traced: bool
     """Whether somebody else makes a graph of it, which is one whatever its pieces are."""
 
@@ -55,12 +60,26 @@ class Schedule(Steps):
     """How the finest levels of an image are cut."""
     stacked: bool = False
     """Whether the items of a batch lie below one another in planes of one."""
+    together: bool = False
+    """Whether both images are decomposed as one batch."""
     compiled: bool = False
     """Whether large steps are compiled."""
     again: bool = False
     """Whether the backward pass computes parts again, of which their arguments are kept."""
+    cached: bool = True
+    """Whether large planes are computed in parts that stay in a processor's cache."""
     few: int = field(default_factory=lambda: FEW_NODES)
     """Levels of at most so many nodes are computed at once."""
+
+    @property
+    def fused(self) -> bool:
+        """As `Steps.fused`."""
+        return self.compiled
+
+    @property
+    def in_cache(self) -> bool:
+        """As `Steps.in_cache`."""
+        return self.cached
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return what a step returns, by its compiled form where that pays."""
@@ -76,7 +95,7 @@ class Schedule(Steps):
 
     def pixels(self, function: Callable[..., Tensor], *planes: Tensor) -> Tensor:
         """Return a function of pixels, a few rows at a time."""
-        if self.compiled:
+        if self.compiled or not self.cached:
             return function(*planes)
         rows = self.rows(planes[0].shape[-2], planes[0].numel(), LARGEST_AT_ONCE)
         parts = zip(*(plane.split(rows, -2) for plane in planes), strict=True)
@@ -88,7 +107,7 @@ class Schedule(Steps):
         """Return `filtering`'s function of a plane; of a large one in strips."""
         size = plane.shape[-2], plane.shape[-1]
         few = math.prod(size) < 2 * BAND_STRIP
-        if few or self.compiled or torch.compiler.is_compiling():
+        if few or self.compiled or not self.cached or torch.compiler.is_compiling():
             whole: tuple[Tensor, Tensor] = self.part(function, plane)
             return whole
         tiling = Tiling.strips(size, BAND_STRIP, 0, 1, bands.REACH)
@@ -101,20 +120,32 @@ class Schedule(Steps):
 
     def rows(self, height: int, numbers: int, most: int) -> int:
         """Return how many of ``height`` rows, ``numbers`` numbers in all, are computed at once."""
-        return height if self.compiled else max(1, most * height // numbers)
+        return height if self.compiled or not self.cached else max(1, most * height // numbers)
 
 
 def chosen(job: Job) -> Schedule:
     """Return how a job is best done."""
     # With gradients strips take less memory and more time, as checkpoints do.
+    compiles = job.compiles and not job.traced
+    again = job.checkpoints and job.gradients and not job.traced
+    if job.accelerated:
+        # Few operations, each of as much as there is: one costs as long as a million numbers take.
+        return Schedule(
+            together=not job.one_sided,
+            compiled=compiles,
+            again=again,
+            cached=False,
+            few=EVERY_LEVEL,
+        )
     large = math.prod(job.size) >= 2 * STRIP
     strips = large and not job.traced and (job.checkpoints or not job.gradients)
-    compiles = job.compiles and not job.traced
+    small = job.items * 3 * math.prod(job.size) <= LARGEST_AT_ONCE
     return Schedule(
         "strips" if strips else "whole",
+        together=small and not (compiles or job.traced or job.one_sided),
         stacked=compiles and job.items > 1 and job.stackable,
         compiled=compiles,
-        again=job.checkpoints and job.gradients and not job.traced,
+        again=again,
     )
 
 

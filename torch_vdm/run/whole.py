@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -31,6 +31,9 @@ from torch_vdm.run.schedule import Schedule
 
 def accumulated(model: Model, schedule: Schedule, test: Tensor, reference: Tensor) -> Tensor:
     """Return `Model.difference` of two images, (B, 1, h, w)."""
+    if schedule.together and model.transform.csf == "levels":
+        planes = torch.cat([model.cone_planes(image) for image in (test, reference)])
+        return compared(model, schedule, *_halves(model.decomposed(planes)))
     if not schedule.stacked:
         first, second = model.represent(test), model.represent(reference)
         return compared(model, schedule, first, second)
@@ -172,6 +175,14 @@ def _changes(model: Model, schedule: Schedule, first: Cortex, second: Cortex) ->
         coarse = _planes(rows, [_size(detail) for detail in first.details[:few]])
     fine = range(few, len(first.details))
     return (*coarse, *(model.change(first, second, number) for number in fine))
+
+
+def _halves(both: Cortex) -> Iterator[Cortex]:
+    """Yield the representations of the first and of the second half of a batch."""
+    parts = [[plane.chunk(2) for plane in planes] for planes in (both.details, both.lowpass)]
+    for half, mean in enumerate(both.mean.chunk(2)):
+        details, lowpass = (tuple(plane[half] for plane in planes) for planes in parts)
+        yield both._replace(details=details, lowpass=lowpass, mean=mean)
 
 
 def _few(schedule: Schedule, cortex: Cortex) -> int:

@@ -8,9 +8,17 @@ from functools import lru_cache, partial
 import torch
 from torch import Tensor
 
+from torch_vdm.model.cortex.border import (
+    Weights,
+    analyse_at_border,
+    is_inside,
+    means_at_border,
+    weights,
+    with_siblings,
+)
 from torch_vdm.model.cortex.transform import CSF, DEEPEST, Base, Cortex, checked_csf, mean_of
 from torch_vdm.model.grid import PAPERS, Grid, thirds
-from torch_vdm.model.quadtree import apart, complete, own, pad_even, together
+from torch_vdm.model.quadtree import apart, pad_even, together
 from torch_vdm.model.steps import PLAIN, Steps
 
 # The exponent of the sum over coefficients by which a diagonal grating is made as strong as a
@@ -169,12 +177,18 @@ def levels(
     ``planes`` (B, C, h, w) are the means of nodes of 2^octaves pixels a side, which lie as ``grid``
     says, of an image of ``size`` = (H, W) pixels; or (1, C, items h, w) of ``items`` of them.
     """
-
-    def analyse(even: Tensor) -> tuple[Tensor, ...]:
-        both: tuple[Tensor, ...] = steps(_analyse, even)
-        return both
-
-    found = _descended(planes, octaves, size, true_means, grid, count, analyse, items)
+    found = _descended(
+        planes,
+        octaves,
+        size,
+        true_means,
+        grid,
+        count,
+        steps,
+        _analyse,
+        analyse_at_border,
+        items,
+    )
     return [detail for _, detail in found], [lowpass for lowpass, _ in found]
 
 
@@ -187,7 +201,9 @@ def lowpasses(
     grid: Grid = PAPERS,
 ) -> list[Tensor]:
     """Return the lowpass that `levels` does, without the details."""
-    found = _descended(planes, octaves, size, true_means, grid, count, _means)
+    found = _descended(
+        planes, octaves, size, true_means, grid, count, PLAIN, _means, means_at_border
+    )
     return [lowpass for (lowpass,) in found]
 
 
@@ -215,10 +231,15 @@ def _descended(
     true_means: bool,
     grid: Grid,
     count: int,
-    analyse: Callable[[Tensor], tuple[Tensor, ...]],
+    steps: Steps,
+    inside: Callable[[Tensor], tuple[Tensor, ...]],
+    at_border: Callable[[Tensor, Weights, Weights], tuple[Tensor, ...]],
     items: int = 1,
 ) -> list[tuple[Tensor, ...]]:
-    """Return what ``analyse`` makes of a plane of even sides, the lowpass first, level by level."""
+    """Return what is made of a plane of even sides, the lowpass first, level by level.
+
+    ``inside``: by a function of whole nodes alone. ``at_border``: by one that knows which are not.
+    """
 
     def each(function: Callable[..., Tensor], *planes: Tensor) -> Tensor:
         """Return what a function makes of every item by itself."""
@@ -227,14 +248,16 @@ def _descended(
         return together(function(*(apart(plane[0], items) for plane in planes))).unsqueeze(0)
 
     found: list[tuple[Tensor, ...]] = []
-    while max(planes.shape[-2] // items, planes.shape[-1]) > 1 and len(found) < count:
-        if true_means:
-            sides = grid.sides(size, octaves + len(found))
-            completed = each(partial(complete, sides=sides), planes)
-            mean_of_all, *details = analyse(completed)
-            planes = each(partial(own, sides=sides), mean_of_all, planes)
+    while (nodes := (planes.shape[-2] // items, planes.shape[-1])) != (1, 1) and len(found) < count:
+        sides = grid.sides(size, octaves + len(found))
+        if not true_means or (not steps.fused and all(map(is_inside, sides, nodes))):
+            planes, *details = steps(inside, each(pad_even, planes))
         else:
-            planes, *details = analyse(each(pad_even, planes))
+            even = each(partial(with_siblings, sides=sides), planes)
+            down, across = weights(sides, nodes, planes)
+            if items > 1:
+                down = Weights(*(weight.repeat(items) for weight in down))
+            planes, *details = steps(at_border, even, down, across)
         found.append((planes, *details))
     return found
 

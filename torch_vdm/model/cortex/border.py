@@ -1,0 +1,156 @@
+"""Nodes at the border of an image count for the pixels that they have.
+
+Where nodes do not begin or end with the image, the first and the last node of a side hold fewer
+pixels than the others, and may lack their sibling. A pair of siblings l and r along a side has a
+mean r + w (l - r) and a detail h (l - r), with w = h = 1/2 as in Eq. 2 between the borders. There:
+
+- the *lowpass* is the mean of the pixels that the pair has;
+- of the *details* a node that holds the share s of its pixels is weakened to n + s (m - n), m its
+  mean and n that of the node beside it, as if the pixels that it lacks were like these. A node
+  without sibling gets the node beside it for one, so that its details are those of a window over
+  the border. Where two nodes are all that there is, they keep the mean of their pixels and differ
+  by the smaller share.
+"""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from torch_vdm.model.grid import Side
+
+
+class Pair(NamedTuple):
+    """What is made of two siblings."""
+
+    own: float
+    """w of the mean of their own pixels."""
+    completed: float
+    """w of the mean in the details across the other side."""
+    half: float
+    """h of the details."""
+
+
+INSIDE = Pair(0.5, 0.5, 0.5)
+
+
+class Weights(NamedTuple):
+    """The same for all pairs along a side of length n, as planes."""
+
+    own: Tensor
+    """(n,)."""
+    completed: Tensor
+    """(n,)."""
+    half: Tensor
+    """(n,)."""
+
+
+def is_inside(side: Side, nodes: int) -> bool:
+    """Return whether all nodes of a side are whole, and all have siblings."""
+    return side.before == 0 and nodes % 2 == 0 and side.first == side.last == 1.0
+
+
+def ends(side: Side, nodes: int) -> tuple[Pair, Pair]:
+    """Return what is made of the first and of the last pair of a side."""
+    first, last = side.first, side.last
+    if nodes == 1:  # beside itself
+        return INSIDE, INSIDE
+    if nodes == 2:
+        half = 0.5 * min(first, last)
+        if side.before == 0:
+            mean = first / (first + last)
+            return (Pair(mean, mean, half),) * 2
+        # Each with the other: (last, first) and (last, first).
+        mean = last / (first + last)
+        return Pair(0.0, mean, half), Pair(1.0, mean, half)
+    if side.before == 0:
+        begin = Pair(first / (1.0 + first), 0.5 * first, 0.5 * first)
+    else:
+        begin = Pair(0.0, 1.0 - 0.5 * first, 0.5 * first)
+    if (nodes + side.before) % 2 == 0:
+        end = Pair(1.0 / (1.0 + last), 1.0 - 0.5 * last, 0.5 * last)
+    else:
+        end = Pair(1.0, 0.5 * last, 0.5 * last)
+    return begin, end
+
+
+def weights(
+    sides: tuple[Side, Side], nodes: tuple[int, int], like: Tensor
+) -> tuple[Weights, Weights]:
+    """Return what is made of every pair along h and along w, of so many nodes each.
+
+    In the precision of ``like``, and where it is.
+    """
+    # Kept: to make them takes longer than to use them on small planes, and on a device it waits.
+    if type(like) is Tensor and not torch.compiler.is_compiling():
+        return _kept(sides, nodes, like.dtype, like.device)
+    return _made(sides, nodes, like.dtype, like.device)
+
+
+@lru_cache(maxsize=512)
+def _kept(*of: Any) -> tuple[Weights, Weights]:
+    with torch.inference_mode(False):
+        return _made(*of)
+
+
+def _made(
+    sides: tuple[Side, Side], nodes: tuple[int, int], dtype: torch.dtype, device: torch.device
+) -> tuple[Weights, Weights]:
+    # No tensor twice, where both are alike: compiled code is specialised on that.
+    down, across = (
+        Weights(*(torch.tensor(row, dtype=dtype, device=device) for row in _rows(side, count)))
+        for side, count in zip(sides, nodes, strict=True)
+    )
+    return down, across
+
+
+def _rows(side: Side, nodes: int) -> list[tuple[float, ...]]:
+    begin, end = ends(side, nodes)
+    count = (nodes + side.before + 1) // 2
+    pairs = [begin, *[INSIDE] * (count - 2), end][:count]
+    return list(zip(*pairs, strict=True))
+
+
+def with_siblings(plane: Tensor, sides: tuple[Side, Side]) -> Tensor:
+    """Return planes (..., C, h, w) with the nodes beside them for siblings where they lack one."""
+    (top, bottom), (left, right) = (
+        (side.before, (nodes + side.before) % 2)
+        for side, nodes in zip(sides, plane.shape[-2:], strict=True)
+    )
+    if plane.shape[-1] == 1 and left + right > 0:
+        plane, left, right = functional.pad(plane, (left, right, 0, 0), mode="replicate"), 0, 0
+    if plane.shape[-2] == 1 and top + bottom > 0:
+        plane, top, bottom = functional.pad(plane, (0, 0, top, bottom), mode="replicate"), 0, 0
+    if top + bottom + left + right == 0:
+        return plane
+    return functional.pad(plane, (left, right, top, bottom), mode="reflect")
+
+
+def analyse_at_border(even: Tensor, down: Weights, across: Weights) -> tuple[Tensor, Tensor]:
+    """Return the lowpass (B, C, h, w) and the details (B, C, 3, h, w) of planes `with_siblings`.
+
+    ``down`` and ``across``: of the pairs along h and w.
+    """
+    left, right = even[..., 0::2], even[..., 1::2]
+    between = left - right
+    own = torch.addcmul(right, across.own, between)
+    # The mean across for d2; the details for d1 and d3.
+    mean, detail = torch.addcmul(right, across.completed, between), across.half * between
+    down = Weights(*(weight.unsqueeze(-1) for weight in down))
+    top, bottom = own[..., 0::2, :], own[..., 1::2, :]
+    lowpass = torch.addcmul(bottom, down.own, top - bottom)
+    top, bottom = detail[..., 0::2, :], detail[..., 1::2, :]
+    between = top - bottom
+    horizontal, diagonal = torch.addcmul(bottom, down.completed, between), down.half * between
+    vertical = down.half * (mean[..., 0::2, :] - mean[..., 1::2, :])
+    return lowpass, torch.stack((horizontal, vertical, diagonal), 2)
+
+
+def means_at_border(even: Tensor, down: Weights, across: Weights) -> tuple[Tensor]:
+    """Return the lowpass of `analyse_at_border` alone."""
+    left, right = even[..., 0::2], even[..., 1::2]
+    own = torch.addcmul(right, across.own, left - right)
+    top, bottom = own[..., 0::2, :], own[..., 1::2, :]
+    return (torch.addcmul(bottom, down.own.unsqueeze(-1), top - bottom),)
