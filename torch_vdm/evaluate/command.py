@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torch_vdm import __version__
+from torch_vdm import __version__, cluster
 from torch_vdm.evaluate import journal, page, peers, statistics, tables, workers
+from torch_vdm.evaluate.cluster import results as on_cluster
 from torch_vdm.evaluate.frames import (
     EvaluationError,
     Job,
@@ -172,7 +173,7 @@ def _matched(options: argparse.Namespace) -> Matched:
 
 def _check_installed(options: argparse.Namespace) -> None:
     """Refuse, before anything is computed, what would fail for a package or has no meaning."""
-    if options.jobs and options.scheduler not in (None, "local"):
+    if options.jobs and options.scheduler not in (None, cluster.LOCAL):
         raise EvaluationError(
             "expected --jobs or the --scheduler of a cluster, which has its own workers, got both; "
             "leave --jobs out"
@@ -185,9 +186,7 @@ def _check_installed(options: argparse.Namespace) -> None:
             "--parquet: pyarrow is not installed; pip install 'torch-vdm[report]'"
         )
     if options.scheduler and importlib.util.find_spec("distributed") is None:
-        raise EvaluationError(
-            "--scheduler: Dask is not installed; pip install 'torch-vdm[cluster]'"
-        )
+        raise EvaluationError(f"--scheduler: Dask is not installed; {cluster.EXTRA}")
 
 
 def _prepared(options: argparse.Namespace) -> dict[tuple[str, str], Result]:
@@ -252,9 +251,7 @@ def _coming(
     """Yield the results of jobs as they come, from a cluster or from processes of this machine."""
     if options.scheduler is None:
         return workers.results(judge, jobs, known, options.jobs or 1)
-    from torch_vdm.evaluate import cluster  # which needs Dask
-
-    return cluster.results(judge, jobs, known, options.scheduler, options.jobs)
+    return on_cluster(judge, jobs, known, options.scheduler, options.jobs)
 
 
 def _add(lines: Journal, known: Result | None, result: Result) -> None:

@@ -48,6 +48,10 @@ class Job:
     path: Path
     before: tuple[Path, Path] | None = None
 
+    def __str__(self) -> str:
+        """Return what it is called in messages."""
+        return f"{self.frame} of {self.test}"
+
 
 @dataclass(frozen=True)
 class Missing:
