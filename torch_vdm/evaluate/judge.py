@@ -250,10 +250,17 @@ def map_paths(output: Path, frame: str, test: str) -> tuple[Path, Path]:
 def settings(options: argparse.Namespace) -> dict[str, object]:
     """Return the options on which figures depend."""
     return {
-        name: value if isinstance(value, bool | int | float | str | None) else str(value)
+        name: _plain(value)
         for name, value in sorted(vars(options).items())
         if name not in NOT_SETTINGS
     }
+
+
+def _plain(value: object) -> object:
+    """Return an option's value as JSON and a reader can have it."""
+    if isinstance(value, list):
+        return ",".join(value)
+    return value if isinstance(value, bool | int | float | str | None) else str(value)
 
 
 def _content(path: Path) -> str:
