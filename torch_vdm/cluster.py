@@ -3,6 +3,7 @@
 It needs Dask's ``distributed``, which is imported when work begins.
 """
 
+import importlib.util
 import logging
 import pickle
 import signal
@@ -63,6 +64,23 @@ class Work(NamedTuple):
     version: str
     shared: Path
     function: bytes
+
+
+def check(scheduler: str, count: int | None) -> None:
+    """Refuse, before anything is done, a scheduler that cannot be had, or workers of another's.
+
+    Raises
+    ------
+    ClusterError
+        If Dask is not installed, or a number of workers is given that is not ours to choose.
+    """
+    if count and scheduler != LOCAL:
+        raise ClusterError(
+            "expected --jobs or the --scheduler of a cluster, which has its own workers, got both; "
+            "leave --jobs out"
+        )
+    if importlib.util.find_spec("distributed") is None:
+        raise ClusterError(f"--scheduler {scheduler}: Dask is not installed; {EXTRA}")
 
 
 def work(function: Callable[..., Any], shared: Path) -> Work:

@@ -4,8 +4,8 @@ import argparse
 import importlib.util
 import io
 import sys
-from collections.abc import Generator, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,7 +29,7 @@ from torch_vdm.evaluate.judge import Bench, Judge, settings
 from torch_vdm.evaluate.overview import Overview
 from torch_vdm.evaluate.statistics import counted
 from torch_vdm.io import check_target
-from torch_vdm.report import plain_console
+from torch_vdm.report import plain_console, progress
 
 RESULTS, TABLE, PARQUET, REPORT = "results.json", "table.csv", "table.parquet", "report.html"
 
@@ -193,11 +193,8 @@ def _matched(options: argparse.Namespace) -> Matched:
 
 def _check_installed(options: argparse.Namespace) -> None:
     """Refuse, before anything is computed, what would fail for a package or has no meaning."""
-    if options.jobs and options.scheduler not in (None, cluster.LOCAL):
-        raise EvaluationError(
-            "expected --jobs or the --scheduler of a cluster, which has its own workers, got both; "
-            "leave --jobs out"
-        )
+    if options.scheduler:
+        cluster.check(options.scheduler, options.jobs)
     missing = peers.missing(options.peers)
     if missing:
         raise EvaluationError(f"--peers {','.join(missing)}: not installed; {peers.EXTRA}")
@@ -205,8 +202,6 @@ def _check_installed(options: argparse.Namespace) -> None:
         raise EvaluationError(
             "--parquet: pyarrow is not installed; pip install 'torch-vdm[report]'"
         )
-    if options.scheduler and importlib.util.find_spec("distributed") is None:
-        raise EvaluationError(f"--scheduler: Dask is not installed; {cluster.EXTRA}")
 
 
 def _prepare(options: argparse.Namespace) -> None:
@@ -232,7 +227,7 @@ def _work_through(
     judge = Judge(bench, options, options.output)
     with (
         closing(_coming(judge, matched.jobs, lines, options)) as coming,
-        _progress(matched.jobs) as advance,
+        progress("comparing", len(matched.jobs)) as advance,
     ):
         for missing in matched.missing:
             _add(lines, Result(frame=missing.frame, test=missing.test, skipped=missing.why))
@@ -267,28 +262,6 @@ def _add(lines: Journal, result: Result) -> None:
     known = lines.get((result.frame, result.test))
     if known is None or known.line() != result.line():
         lines.add(result)
-
-
-@contextmanager
-def _progress(jobs: Sequence[Job]) -> Iterator[Any]:
-    """Show a bar with the time left on a terminal; yield what moves it on by one."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    bar = Progress(
-        "comparing",
-        BarColumn(),
-        MofNCompleteColumn(),
-        "left:",
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
-    with bar:
-        task = bar.add_task("", total=len(jobs))
-        yield lambda: bar.advance(task)
 
 
 def _check_any(overview: Overview) -> None:

@@ -34,7 +34,7 @@ class EvaluationError(ValueError):
         super().__init__(printable(message))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Job:
     """One frame of one test, and the files to compare.
 
@@ -53,7 +53,7 @@ class Job:
         return f"{self.frame} of {self.test}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Missing:
     """A frame of a test that cannot be compared, and why."""
 
