@@ -98,7 +98,9 @@ def write_junit(
             for result in results:
                 if result.test == test:
                     _add_case(xml, result, fail_above)
+            xml.ignorableWhitespace("\n")
             xml.endElement("testsuite")
+        xml.ignorableWhitespace("\n")
         xml.endElement("testsuites")
         xml.endDocument()
 
