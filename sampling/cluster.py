@@ -150,6 +150,7 @@ def render_all(options: argparse.Namespace, views: Views) -> tuple[str, bool]:
         contextlib.closing(answers(sent, pictures, told, scheduler, workers)) as coming,
         progress("rendering", len(pictures)) as advance,
     ):
+        said = sys.stderr  # before a worker in this process takes it for its own
         try:
             for picture, done in coming:
                 done = done or Done(
@@ -158,18 +159,18 @@ def render_all(options: argparse.Namespace, views: Views) -> tuple[str, bool]:
                     "give the workers more memory",
                 )
                 for warning in done.warnings:
-                    print(f"vdm-render: warning: {picture}: {warning}", file=sys.stderr)
+                    print(f"vdm-render: warning: {picture}: {warning}", file=said)
                 if done.failed:
                     failed[picture] = done.failed
                     if len(failed) <= NAMED:
                         number = "" if picture.frame is None else f"frame {picture.frame}: "
-                        print(f"vdm-render: {number}{done.failed}", file=sys.stderr)
+                        print(f"vdm-render: {number}{done.failed}", file=said)
                 total.add(picture, done)
                 advance()
         except KeyboardInterrupt:
             print(
                 f"vdm-render: what is done is kept in {options.output}; --resume goes on",
-                file=sys.stderr,
+                file=said,
             )
             raise
     text = total.text(options.output)
