@@ -31,8 +31,9 @@ from torch_vdm.report import progress
 # The parameter of a scene that a frame's number is given to, and digits of the number in a name.
 FRAME, DIGITS = "frame", 4
 
-# What says in an output folder that it is one, and by which command.
-NAME = "render.json"
+# What says in an output folder, as JSON, that it is one, and with which settings; no picture's
+# file can be called so.
+NAME = "vdm-render.run"
 
 # Workers of this machine: while one decides, on a single processor, the other renders, on all.
 # Status: choice.
@@ -281,8 +282,8 @@ def _done(views: Views, options: argparse.Namespace) -> Done:
 
 
 def _rendered(views: Views, options: argparse.Namespace) -> Done:
-    key, record = _key(options), options.output.with_suffix(".json")
-    known = _known(record, key)
+    record = options.output.with_suffix(".json")
+    known = _known(record, options)
     if known is not None:
         return Done(known, stood=True)
     kept = _kept(options.checkpoint)
@@ -299,6 +300,7 @@ def _rendered(views: Views, options: argparse.Namespace) -> Done:
         told = views(options)
     for figures in told:
         figures["written"] = figures["written"][:1]  # its checkpoint goes
+    key = _key(options, *(told[0][name] for name in ("mitsuba", "variant", "fingerprint")))
     with atomic_path(record) as temporary:
         temporary.write_text(json.dumps({"key": key, "views": told}, indent=1) + "\n")
     for path in _kept(options.checkpoint):
@@ -306,14 +308,9 @@ def _rendered(views: Views, options: argparse.Namespace) -> Done:
     return Done(told)
 
 
-def _key(options: argparse.Namespace) -> str:
-    """Return the hash of all that the picture depends on."""
-    with preserved():
-        renderer = MitsubaRenderer(
-            options.scene, dict(options.parameters), filter=options.filter, variant=options.variant
-        )
-    versions = __version__, renderer.version, renderer.variant
-    told = json.dumps([versions, renderer.fingerprint, _settings(options)])
+def _key(options: argparse.Namespace, mitsuba: str, variant: str, fingerprint: str) -> str:
+    """Return the hash of all that a picture depends on; ``fingerprint`` is of its scene."""
+    told = json.dumps([__version__, mitsuba, variant, fingerprint, _settings(options)])
     return hashlib.sha256(told.encode()).hexdigest()
 
 
@@ -324,16 +321,23 @@ def _settings(options: argparse.Namespace) -> dict[str, object]:
     }
 
 
-def _known(record: Path, key: str) -> list[dict[str, Any]] | None:
-    """Return what is known of a picture that is there, and of these settings."""
+def _known(record: Path, options: argparse.Namespace) -> list[dict[str, Any]] | None:
+    """Return what is known of a picture that is there, of this scene and these settings."""
     try:
         told = json.loads(record.read_text())
-        views: list[dict[str, Any]] = told["views"] if told["key"] == key else []
+        views: list[dict[str, Any]] = told["views"]
         # By its name, for the folder may have been moved.
         files = [record.with_name(Path(figures["written"][0]).name) for figures in views]
+        key: str = told["key"]
     except (OSError, ValueError, LookupError, TypeError):
         return None
-    return views if files and all(path.is_file() for path in files) else None
+    if not all(path.is_file() for path in files):
+        return None
+    with preserved():
+        scene = MitsubaRenderer(
+            options.scene, dict(options.parameters), filter=options.filter, variant=options.variant
+        )
+    return views if key == _key(options, scene.version, scene.variant, scene.fingerprint) else None
 
 
 def _kept(checkpoint: Path) -> list[Path]:

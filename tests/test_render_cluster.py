@@ -83,7 +83,7 @@ def test_a_worker_that_is_killed_loses_nothing(
         assert victim.pid != before
     names = [f"lamp.{number:04}" for number in range(12)]
     wanted = {*(f"{name}.exr" for name in names), *(f"{name}.json" for name in names)}
-    assert {path.name for path in out.iterdir()} == wanted | {"render.json"}
+    assert {path.name for path in out.iterdir()} == wanted | {"vdm-render.run"}
     # The one that was killed may have written its last picture, and not said so.
     said = re.match(r"(\d+) rendered, (\d+) done before, 0 failed", capsys.readouterr().out)
     assert said is not None
@@ -110,7 +110,9 @@ def test_what_is_done_stands_and_what_changed_is_done_again(
     before = times()
     capsys.readouterr()
     assert main(words) == 2
-    assert "expected a folder without pictures, got one with render.json" in capsys.readouterr().err
+    assert (
+        "expected a folder without pictures, got one with vdm-render.run" in capsys.readouterr().err
+    )
     moved = out.rename(tmp_path / "moved")
     words[words.index(str(out))] = str(moved)
     out = moved
