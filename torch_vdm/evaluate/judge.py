@@ -291,6 +291,7 @@ def _luminance_change(reference: Tensor, test: Tensor) -> float | None:
     """Return how much brighter the test is, relative; None beside a black reference."""
     weights = torch.tensor(BT709_TO_XYZ[1], dtype=torch.float64)
     one, other = (
-        (image.double().mean((1, 2)) * weights).sum().item() for image in (reference, test)
+        (image.mean((1, 2), dtype=torch.float64) * weights).sum().item()
+        for image in (reference, test)
     )
     return other / one - 1.0 if one > 0.0 else None
