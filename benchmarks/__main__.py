@@ -14,6 +14,8 @@ BENCHMARKS = {
     "--quick",
     "effects": "what each effect costs, and what leaving it out shows; 5 minutes, 10 seconds with "
     "--quick",
+    "evaluate": "what many frames cost beside the metric, and what they hold; 20 minutes, "
+    "1 with --quick",
     "large": "memory on images up to 16,384 x 16,384; 15 minutes, 15 seconds with --quick",
     "launches": "how many operations a map is, which a GPU waits for; 1 minute, 5 seconds with "
     "--quick",

@@ -6,12 +6,14 @@ import json
 import shlex
 import signal
 import sys
+import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from sampling import cluster
 from sampling.renderers.filter import FILTERS, SCENE
 from sampling.renderers.mitsuba import VARIANTS
 from sampling.rendering import EFFECTS, Result, Watch, render, seen, terminal
@@ -19,6 +21,7 @@ from sampling.sampler import Report
 from sampling.strategies import STRATEGIES
 from torch_vdm import __version__
 from torch_vdm.cli import (
+    BAD_INPUT,
     DONE,
     INTERRUPTED,
     OBSERVERS,
@@ -53,8 +56,8 @@ def _parser() -> argparse.ArgumentParser:
         "Exit status: 0 done, 2 bad input, 3 internal error, 130 interrupted.",
     )
     parser.add_argument("--version", action="version", version=f"vdm-render {__version__}")
-    parser.add_argument("scene", type=Path, metavar="SCENE.xml")
-    parser.add_argument("--output", type=Path, required=True, metavar="OUT.exr")
+    parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE.xml")
+    parser.add_argument("--output", type=Path, required=True, metavar="OUT.exr|DIR")
     where = parser.add_argument_group("where samples go, and when there are enough")
     where.add_argument("--strategy", choices=tuple(STRATEGIES), default="perceptual")
     where.add_argument(
@@ -129,6 +132,7 @@ def _parser() -> argparse.ArgumentParser:
         "--resume", action="store_true", help="go on where the checkpoint ends; the same image"
     )
     output.add_argument("--json", metavar="OUT.json|-", help="the figures; - prints them alone")
+    cluster.add_arguments(parser)
     return parser
 
 
@@ -155,6 +159,8 @@ class _Console(Watch):
             signal.signal(kind, handler)
 
     def begin(self) -> None:
+        if threading.current_thread() is not threading.main_thread():
+            return  # of a cluster's worker, whose own signals are
         kinds = signal.SIGINT, signal.SIGTERM
         self._before = {kind: signal.signal(kind, self._note) for kind in kinds}
 
@@ -176,17 +182,13 @@ class _Console(Watch):
 
 
 def _run(options: argparse.Namespace, words: list[str]) -> int:
+    if cluster.are_many(options):
+        text, failed = cluster.render_all(options, _views)
+        tell(text)
+        return BAD_INPUT if failed else DONE
+    (options.scene,) = options.scenes
+    told = _views(options)
     every = options.sensor == ALL
-    sensors: list[int | str] = [0 if every else options.sensor]
-    told: list[dict[str, Any]] = []
-    while len(told) < len(sensors):
-        number = len(told)
-        result = _rendered(options, sensors[number], number if every else None)
-        if every:
-            sensors = list(range(result.figures["sensors"]))
-        told.append(result.figures)
-        if result.stop_reason == "interrupted":
-            break
     if options.json is not None:
         text = json.dumps(told if every else told[0], indent=2) + "\n"
         if options.json == "-":
@@ -206,6 +208,22 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         file=sys.stderr,
     )
     return INTERRUPTED
+
+
+def _views(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Render one view, or all that the scene has; return what is known of each."""
+    every = options.sensor == ALL
+    sensors: list[int | str] = [0 if every else options.sensor]
+    told: list[dict[str, Any]] = []
+    while len(told) < len(sensors):
+        number = len(told)
+        result = _rendered(options, sensors[number], number if every else None)
+        if every:
+            sensors = list(range(result.figures["sensors"]))
+        told.append(result.figures)
+        if result.stop_reason == "interrupted":
+            break
+    return told
 
 
 def _rendered(options: argparse.Namespace, sensor: int | str, number: int | None) -> Result:

@@ -436,6 +436,7 @@ class _Run:
             "sensors": renderer.sensors,
             "version": __version__,
             "mitsuba": renderer.version,
+            "fingerprint": identity["scene"],
         }
         return Result(
             image=sampler.image,

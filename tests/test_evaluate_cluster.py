@@ -13,16 +13,17 @@ from typing import Any, cast
 import pytest
 import torch
 
-from torch_vdm import write_image
+from torch_vdm import cluster, write_image
 from torch_vdm.cli import main
+from torch_vdm.cluster import ClusterError
 from torch_vdm.evaluate import journal
-from torch_vdm.evaluate.frames import EvaluationError, Job
+from torch_vdm.evaluate.cluster import placed, results
+from torch_vdm.evaluate.frames import Job
 from torch_vdm.evaluate.journal import Journal, Result
 from torch_vdm.evaluate.judge import Judge
 from torch_vdm.io import ImageError
 
 distributed = pytest.importorskip("distributed")
-from torch_vdm.evaluate import cluster  # noqa: E402 - it needs Dask
 
 
 @dataclass
@@ -93,7 +94,7 @@ def test_no_more_is_in_hand_than_the_cluster_can_do(
     judge, address = fragile(tmp_path), threads.scheduler_address
     most = most_held = 0
     found: set[str] = set()
-    for result in cluster.results(judge, made, {}, address, None):
+    for result in results(judge, made, {}, address, None):
         assert result.frame not in found
         found.add(result.frame)
         # Whatever was taken and not yet given back: with the cluster, or on its way.
@@ -106,7 +107,7 @@ def test_no_more_is_in_hand_than_the_cluster_can_do(
 
 def test_many_threads_have_more_in_hand(tmp_path: Path, threads: Any) -> None:
     made = Watched(600)
-    coming = cluster.results(fragile(tmp_path), made, {}, threads.scheduler_address, None)
+    coming = results(fragile(tmp_path), made, {}, threads.scheduler_address, None)
     next(coming)
     assert made.taken == cluster.FEWEST_IN_HAND
     coming.close()
@@ -121,7 +122,7 @@ def test_many_threads_have_more_in_hand(tmp_path: Path, threads: Any) -> None:
 def test_one_that_dies_takes_its_frame_alone(tmp_path: Path) -> None:
     judge = fragile(tmp_path, dies_of="2")
     known = {("3", "A"): Result(frame="3", test="A", key="known")}
-    found = {each.frame: each for each in cluster.results(judge, jobs(7), known, "local", 1)}
+    found = {each.frame: each for each in results(judge, jobs(7), known, "local", 1)}
     assert set(found) == {str(number) for number in range(7)}
     assert [frame for frame, each in found.items() if each.skipped] == ["2"]
     assert "2.exr: every worker that compared it died" in found["2"].skipped
@@ -135,7 +136,7 @@ def test_one_that_dies_takes_its_frame_alone(tmp_path: Path) -> None:
     ("error", "expected", "told"),
     [
         (ImageError, ImageError, "^out: cannot be written: no space$"),
-        (RuntimeError, EvaluationError, "3 of A: a worker failed, RuntimeError: out: cannot"),
+        (RuntimeError, ClusterError, "3 of A: a worker failed, RuntimeError: out: cannot"),
     ],
 )
 def test_what_fails_ends_all_in_one_line(
@@ -143,17 +144,17 @@ def test_what_fails_ends_all_in_one_line(
 ) -> None:
     judge = fragile(tmp_path, fails_at="3", error=error)
     with pytest.raises(expected, match=told):
-        list(cluster.results(judge, jobs(7), {}, threads.scheduler_address, None))
+        list(results(judge, jobs(7), {}, threads.scheduler_address, None))
 
 
 def test_workers_that_differ_are_refused(tmp_path: Path, threads: Any) -> None:
     judge = fragile(tmp_path)
     (tmp_path / journal.NAME).unlink()  # as on a machine that does not see the folder
-    with pytest.raises(EvaluationError, match="name one on a shared file system"):
-        list(cluster.results(judge, jobs(2), {}, threads.scheduler_address, None))
-    other = cluster.Sent("0.0", tmp_path, b"")
-    with pytest.raises(EvaluationError, match=r"expected torch-vdm 0\.0 on every worker, got"):
-        cluster._judged(other, jobs(1)[0], None)
+    with pytest.raises(ClusterError, match="name one on a shared file system"):
+        list(results(judge, jobs(2), {}, threads.scheduler_address, None))
+    other = cluster.Work("0.0", tmp_path, b"")
+    with pytest.raises(ClusterError, match=r"expected torch-vdm 0\.0 on every worker, got"):
+        cluster._done(other, jobs(1)[0], None)
 
 
 def killed_after(worker: Any, lines: Path, count: int) -> None:
@@ -210,7 +211,7 @@ def test_jobs_and_a_cluster_of_its_own_are_refused(
 
 def test_paths_are_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    job = cluster._placed(Job("1", "A", Path("r.exr"), Path("t.exr"), (Path("a"), Path("b"))))
+    job = placed(Job("1", "A", Path("r.exr"), Path("t.exr"), (Path("a"), Path("b"))))
     assert (job.reference, job.path) == (tmp_path / "r.exr", tmp_path / "t.exr")
     assert job.before == (tmp_path / "a", tmp_path / "b")
 
@@ -224,10 +225,10 @@ def test_a_scheduler_that_is_lost_is_told(tmp_path: Path) -> None:
         ) as started,
         distributed.Client(started, set_as_default=False) as administrator,
     ):  # fmt: skip
-        coming = cluster.results(fragile(tmp_path), made, {}, started.scheduler_address, None)
+        coming = results(fragile(tmp_path), made, {}, started.scheduler_address, None)
         next(coming)
         threading.Timer(0.3, administrator.shutdown).start()
-        with pytest.raises(EvaluationError, match="the scheduler was lost"):
+        with pytest.raises(ClusterError, match="the scheduler was lost"):
             list(coming)
     assert made.taken < len(made)
 
@@ -247,7 +248,7 @@ def test_a_scheduler_that_does_not_answer_is_told(tmp_path: Path, where: str, to
     place = where if "://" in where else str(tmp_path / where)
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
-        pytest.raises(EvaluationError, match=told) as error,
+        pytest.raises(ClusterError, match=told) as error,
     ):
-        list(cluster.results(fragile(tmp_path), jobs(1), {}, place, None))
+        list(results(fragile(tmp_path), jobs(1), {}, place, None))
     assert "\n" not in str(error.value)

@@ -82,6 +82,18 @@ def test_a_folder_without_images_is_refused(tmp_path: Path, place: str) -> None:
         match(str(tmp_path / place), {"A": str(tmp_path)}, tmp_path / "out")
 
 
+@pytest.mark.parametrize(
+    ("place", "told"),
+    [("1.exr", "name its folder"), ("out", "outside the output"), ("out/*", "outside the output")],
+)
+def test_a_file_and_the_output_are_no_folders_of_frames(
+    tmp_path: Path, place: str, told: str
+) -> None:
+    touch(tmp_path, "1.exr", "out/maps/A/1.exr")
+    with pytest.raises(EvaluationError, match=told):
+        match(str(tmp_path / place), {"A": str(tmp_path)}, tmp_path / "out")
+
+
 @pytest.mark.parametrize("test", ["..", "a/b", "", "a\nb", "C:x"])
 def test_a_test_is_named_by_a_word(tmp_path: Path, test: str) -> None:
     touch(tmp_path, "1.exr")

@@ -20,7 +20,7 @@ from torch_vdm.evaluate.frames import (
     match,
     read_manifest,
 )
-from torch_vdm.evaluate.journal import NAME, Journal, Result, read
+from torch_vdm.evaluate.journal import NAME, Journal, Result
 
 # The same examples each time; none is kept between runs. A folder is made for each.
 law = settings(
@@ -192,6 +192,12 @@ def test_any_pattern_over_any_names(files: list[str], first: str, second: str) -
             check_matched(found)
             stems = {Path(f"{name}.exr").stem for name in files}
             assert len(found.jobs) + len(found.missing) == 2 * len(stems)
+
+
+def read(folder: Path) -> dict[tuple[str, str], Result]:
+    """Return what a journal has."""
+    with Journal(folder) as lines:
+        return dict(lines)
 
 
 def results(count: int) -> list[Result]:

@@ -5,8 +5,14 @@ from pathlib import Path
 import pytest
 
 from torch_vdm.evaluate import journal
-from torch_vdm.evaluate.journal import NAME, Journal, Result, read
+from torch_vdm.evaluate.journal import NAME, Journal, Result
 from torch_vdm.io import ImageError
+
+
+def read(folder: Path) -> dict[tuple[str, str], Result]:
+    """Return what a journal has."""
+    with Journal(folder) as lines:
+        return dict(lines)
 
 
 def result(frame: str, value: float) -> Result:

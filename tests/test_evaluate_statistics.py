@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from torch_vdm.evaluate.statistics import FEWEST, Paired, compare, interval
+from torch_vdm.evaluate.statistics import FEWEST, Floats, Paired, compare, interval
 
 
-def pairs(one: list[float], other: list[float]) -> list[tuple[float, float]]:
-    return list(zip(one, other, strict=True))
+def pairs(one: list[float], other: list[float]) -> Floats:
+    return np.stack([one, other], 1)
 
 
 def test_a_difference_is_said_in_words() -> None:
@@ -41,7 +41,7 @@ def test_few_frames_tell_nothing() -> None:
     assert "5 frames; it takes 6" in few.sentence("Maximum")
     enough = compare("A", "B", "max_jnd", pairs([2.0] * FEWEST, [1.0] * FEWEST))
     assert "B is better than A" in enough.sentence("Maximum")
-    one = compare("A", "B", "max_jnd", [(1.0, 2.0)])
+    one = compare("A", "B", "max_jnd", pairs([1.0], [2.0]))
     assert "1 frame;" in one.sentence("Maximum")
 
 
@@ -69,4 +69,6 @@ def test_ranges_have_the_same_digits() -> None:
     assert "0.28 to 0.30 JND less" in told(0.28, 0.3)
     assert "12 to 140 JND less" in told(12.0, 140.0)
     assert "-0.20 to +1.50 JND in the median" in told(-0.2, 1.5)
-    assert "+0.0 to +0.0 JND" in told(0.0, 0.0)
+    assert "0.571 to 0.574 JND less" in told(0.571, 0.574)
+    assert " 0.57 JND less" in told(0.57, 0.57)
+    assert "told, +0.0 JND" in told(0.0, 0.0)

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from torch_vdm import __version__
+from torch_vdm.cluster import ClusterError
 from torch_vdm.evaluate import command as evaluation
 from torch_vdm.evaluate.frames import EvaluationError
 from torch_vdm.evaluate.judge import Bench
@@ -320,7 +321,7 @@ def _evaluate(options: argparse.Namespace) -> int:
         assumptions.append(MAY_MISS)
     try:
         outcome = evaluation.run(options, Bench(_pairs, _metric, LARGEST_WHOLE), assumptions)
-    except EvaluationError as error:
+    except (EvaluationError, ClusterError) as error:
         raise UsageError(str(error)) from error
     tell(outcome.text)
     return EXCEEDED if outcome.exceeded else DONE

@@ -1,7 +1,8 @@
 """What a comparison says: its figures, its verdict, its table, its heat map."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO, TypedDict
@@ -176,6 +177,28 @@ def plain_console(text: TextIO, width: int) -> "Console":
         markup=False,
         soft_wrap=True,
     )
+
+
+@contextmanager
+def progress(what: str, count: int) -> Iterator[Callable[[], None]]:
+    """Show a bar with the time left on a terminal; yield what moves it on by one."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    bar = Progress(
+        what,
+        BarColumn(),
+        MofNCompleteColumn(),
+        "left:",
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+    with bar:
+        task = bar.add_task("", total=count)
+        yield lambda: bar.advance(task)
 
 
 def table(comparison: Comparison, luminances: tuple[float, float]) -> "RenderableType":

@@ -4,16 +4,18 @@ import argparse
 import importlib.util
 import io
 import sys
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
-from itertools import combinations
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from torch_vdm import __version__
-from torch_vdm.evaluate import journal, page, peers, statistics, tables, workers
+from torch_vdm import __version__, cluster
+from torch_vdm.evaluate import journal, page, peers, tables, workers
+from torch_vdm.evaluate.cluster import results as on_cluster
+from torch_vdm.evaluate.figures import FIGURES
 from torch_vdm.evaluate.frames import (
     EvaluationError,
     Job,
@@ -22,11 +24,12 @@ from torch_vdm.evaluate.frames import (
     natural,
     read_manifest,
 )
-from torch_vdm.evaluate.journal import Journal, Result
+from torch_vdm.evaluate.journal import Journal, Result, Selection
 from torch_vdm.evaluate.judge import Bench, Judge, settings
-from torch_vdm.evaluate.statistics import Paired, counted
+from torch_vdm.evaluate.overview import Overview
+from torch_vdm.evaluate.statistics import counted
 from torch_vdm.io import check_target
-from torch_vdm.report import plain_console
+from torch_vdm.report import plain_console, progress
 
 RESULTS, TABLE, PARQUET, REPORT = "results.json", "table.csv", "table.parquet", "report.html"
 
@@ -40,9 +43,6 @@ COMPARED = {
 
 # Figures that the terminal has no room for; they are in the table that is written.
 NOT_IN_TERMINAL = ("mean_luminance_change", "flicker_mean_jnd", "flicker_visible_fraction")
-
-# Skipped frames that are named on the terminal. Status: choice.
-NAMED = 5
 
 
 class Outcome(NamedTuple):
@@ -127,10 +127,28 @@ def run(options: argparse.Namespace, bench: Bench, assumptions: Sequence[str]) -
     """
     _check_installed(options)
     matched = _matched(options)
-    known = _prepared(options)
-    results = _worked_through(options, bench, matched, known)
-    compared = _compared(matched.tests, results)
-    summary = _summary(matched.tests, results, options.fail_above)
+    _prepare(options)
+    with Journal(options.output) as lines:
+        _work_through(options, bench, matched, lines)
+        keys = _ordered(matched)
+        results = Selection(lines, keys)
+        frames = len({frame for frame, _ in keys})
+        overview = Overview.of(matched.tests, frames, results)
+        sentences = _write(options, overview, results, assumptions)
+    _check_any(overview)
+    exceeded = sum(overview.exceeded(options.fail_above))
+    return Outcome(_text(options, overview, sentences, exceeded), bool(exceeded))
+
+
+def _write(
+    options: argparse.Namespace,
+    overview: Overview,
+    results: Iterable[Result],
+    assumptions: Sequence[str],
+) -> list[str]:
+    """Write tables and report; return what is said of the tests beside one another."""
+    compared = overview.compare(COMPARED)
+    sentences = [pair.sentence(COMPARED[pair.figure]) for pair in compared]
     output: Path = options.output
     told = {
         "version": __version__,
@@ -140,17 +158,20 @@ def run(options: argparse.Namespace, bench: Bench, assumptions: Sequence[str]) -
         "fail_above": options.fail_above,
         **settings(options),
     }
-    tables.write_json(output / RESULTS, told, summary, compared, results)
-    tables.write_csv(output / TABLE, results)
+    of_all = {
+        "settings": told,
+        "summary": overview.summary(options.fail_above),
+        "comparisons": [asdict(pair) for pair in compared],
+    }
+    names = list(overview.values)
+    tables.write_json(output / RESULTS, of_all, results)
+    tables.write_csv(output / TABLE, names, results)
     if options.parquet:
-        tables.write_parquet(output / PARQUET, results)
+        tables.write_parquet(output / PARQUET, names, results)
     if options.junit:
-        tables.write_junit(options.junit, results, options.fail_above)
-    sentences = [pair.sentence(COMPARED[pair.figure]) for pair in compared]
-    page.write(output / REPORT, matched.tests, results, sentences, told, assumptions)
-    _check_any(results)
-    exceeded = [result for result in results if tables.exceeds(result, options.fail_above)]
-    return Outcome(_text(options, matched.tests, results, sentences, exceeded), bool(exceeded))
+        tables.write_junit(options.junit, overview, results, options.fail_above)
+    page.write(output / REPORT, overview, results, sentences, told, assumptions)
+    return sentences
 
 
 def _matched(options: argparse.Namespace) -> Matched:
@@ -172,11 +193,8 @@ def _matched(options: argparse.Namespace) -> Matched:
 
 def _check_installed(options: argparse.Namespace) -> None:
     """Refuse, before anything is computed, what would fail for a package or has no meaning."""
-    if options.jobs and options.scheduler not in (None, "local"):
-        raise EvaluationError(
-            "expected --jobs or the --scheduler of a cluster, which has its own workers, got both; "
-            "leave --jobs out"
-        )
+    if options.scheduler:
+        cluster.check(options.scheduler, options.jobs)
     missing = peers.missing(options.peers)
     if missing:
         raise EvaluationError(f"--peers {','.join(missing)}: not installed; {peers.EXTRA}")
@@ -184,14 +202,10 @@ def _check_installed(options: argparse.Namespace) -> None:
         raise EvaluationError(
             "--parquet: pyarrow is not installed; pip install 'torch-vdm[report]'"
         )
-    if options.scheduler and importlib.util.find_spec("distributed") is None:
-        raise EvaluationError(
-            "--scheduler: Dask is not installed; pip install 'torch-vdm[cluster]'"
-        )
 
 
-def _prepared(options: argparse.Namespace) -> dict[tuple[str, str], Result]:
-    """Make the output folder, and return what is known in it."""
+def _prepare(options: argparse.Namespace) -> None:
+    """Make the output folder, where none with results is in the way."""
     output: Path = options.output
     if output.exists() and not output.is_dir():
         raise EvaluationError(f"{output}: expected a folder to write to, got a file")
@@ -204,196 +218,110 @@ def _prepared(options: argparse.Namespace) -> dict[tuple[str, str], Result]:
     output.mkdir(parents=True, exist_ok=True)
     if options.junit:  # it may lie in the output folder
         check_target(options.junit)
-    return journal.read(output)
 
 
-def _worked_through(
-    options: argparse.Namespace,
-    bench: Bench,
-    matched: Matched,
-    known: dict[tuple[str, str], Result],
-) -> list[Result]:
-    """Return the results of all frames, in their order; each is in the journal as it comes."""
-    results = {
-        (missing.frame, missing.test): Result(
-            frame=missing.frame, test=missing.test, skipped=missing.why
-        )
-        for missing in matched.missing
-    }
+def _work_through(
+    options: argparse.Namespace, bench: Bench, matched: Matched, lines: Journal
+) -> None:
+    """Have the results of all frames in the journal, each as it comes."""
     judge = Judge(bench, options, options.output)
     with (
-        Journal(options.output) as lines,
-        closing(_coming(judge, matched.jobs, known, options)) as coming,
-        _progress(matched.jobs) as advance,
+        closing(_coming(judge, matched.jobs, lines, options)) as coming,
+        progress("comparing", len(matched.jobs)) as advance,
     ):
-        for key, result in results.items():
-            _add(lines, known.get(key), result)
+        for missing in matched.missing:
+            _add(lines, Result(frame=missing.frame, test=missing.test, skipped=missing.why))
         try:
             for result in coming:
-                key = result.frame, result.test
-                _add(lines, known.get(key), result)
-                results[key] = result
+                _add(lines, result)
                 advance()
         except KeyboardInterrupt:
             print(f"what is done is kept in {options.output}; --resume goes on", file=sys.stderr)
             raise
+
+
+def _ordered(matched: Matched) -> list[tuple[str, str]]:
+    """Return all frames and tests that were asked for, in their order."""
     place = {test: number for number, test in enumerate(matched.tests)}
-    return [
-        results[key] for key in sorted(results, key=lambda key: (natural(key[0]), place[key[1]]))
-    ]
+    keys = {(job.frame, job.test) for job in matched.jobs}
+    keys |= {(missing.frame, missing.test) for missing in matched.missing}
+    return sorted(keys, key=lambda key: (natural(key[0]), place[key[1]]))
 
 
 def _coming(
-    judge: Judge,
-    jobs: Sequence[Job],
-    known: dict[tuple[str, str], Result],
-    options: argparse.Namespace,
+    judge: Judge, jobs: Sequence[Job], lines: Journal, options: argparse.Namespace
 ) -> Generator[Result, None, None]:
     """Yield the results of jobs as they come, from a cluster or from processes of this machine."""
     if options.scheduler is None:
-        return workers.results(judge, jobs, known, options.jobs or 1)
-    from torch_vdm.evaluate import cluster  # which needs Dask
-
-    return cluster.results(judge, jobs, known, options.scheduler, options.jobs)
+        return workers.results(judge, jobs, lines, options.jobs or 1)
+    return on_cluster(judge, jobs, lines, options.scheduler, options.jobs)
 
 
-def _add(lines: Journal, known: Result | None, result: Result) -> None:
+def _add(lines: Journal, result: Result) -> None:
     """Add a result to the journal, unless the journal has it."""
+    known = lines.get((result.frame, result.test))
     if known is None or known.line() != result.line():
         lines.add(result)
 
 
-@contextmanager
-def _progress(jobs: Sequence[Job]) -> Iterator[Any]:
-    """Show a bar with the time left on a terminal; yield what moves it on by one."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    bar = Progress(
-        "comparing",
-        BarColumn(),
-        MofNCompleteColumn(),
-        "left:",
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
-    with bar:
-        task = bar.add_task("", total=len(jobs))
-        yield lambda: bar.advance(task)
-
-
-def _compared(tests: Sequence[str], results: Sequence[Result]) -> list[Paired]:
-    """Compare every two tests by every figure that both have."""
-    values: dict[tuple[str, str], dict[str, float]] = {}
-    for result in results:
-        for name in COMPARED:
-            value = result.figures.get(name)
-            if value is not None:
-                values.setdefault((name, result.test), {})[result.frame] = value
-    found = []
-    for one, other in combinations(tests, 2):
-        for name in COMPARED:
-            first, second = values.get((name, one), {}), values.get((name, other), {})
-            common = [(first[frame], second[frame]) for frame in first if frame in second]
-            if common:
-                found.append(statistics.compare(one, other, name, common))
-    return found
-
-
-def _summary(
-    tests: Sequence[str], results: Sequence[Result], fail_above: float | None
-) -> dict[str, object]:
-    """Return, for each test, how many frames were compared, and medians and extremes."""
-    told: dict[str, object] = {}
-    for test in tests:
-        of_test = [result for result in results if result.test == test]
-        done = [result for result in of_test if not result.skipped]
-        told[test] = {
-            "compared": len(done),
-            "skipped": len(of_test) - len(done),
-            "exceeded": sum(tables.exceeds(result, fail_above) for result in done),
-            "figures": {
-                name: _spread([v for r in done if (v := r.figures.get(name)) is not None])
-                for name in tables.present(done)
-            },
-        }
-    return {"tests": told}
-
-
-def _spread(values: Sequence[float]) -> dict[str, float] | None:
-    if not values:
-        return None
-    return {"median": float(np.median(values)), "least": min(values), "most": max(values)}
-
-
-def _check_any(results: Sequence[Result]) -> None:
-    skipped = [result for result in results if result.skipped]
-    if len(skipped) == len(results):
-        first = skipped[0]
+def _check_any(overview: Overview) -> None:
+    if not any(overview.compared):
+        first = overview.first_skipped[0]
         raise EvaluationError(
-            f"nothing could be compared: {counted(len(skipped), 'comparison')} skipped, the first "
-            f"is {first.frame} of {first.test}: {first.skipped}"
+            f"nothing could be compared: {counted(sum(overview.skipped), 'comparison')} skipped, "
+            f"the first is {first.frame} of {first.test}: {first.skipped}"
         )
 
 
 def _text(
-    options: argparse.Namespace,
-    tests: Sequence[str],
-    results: Sequence[Result],
-    sentences: Sequence[str],
-    exceeded: Sequence[Result],
+    options: argparse.Namespace, overview: Overview, sentences: Sequence[str], exceeded: int
 ) -> str:
     """Return what is said on the terminal at the end."""
     text = io.StringIO()
     console = plain_console(text, 100)
-    console.print(_table(tests, results))
+    console.print(_table(overview))
     for sentence in sentences:
         console.print(sentence, style="bold")
-    skipped = [result for result in results if result.skipped]
+    skipped = sum(overview.skipped)
     if skipped:
-        console.print(f"Skipped {len(skipped)} of {counted(len(results), 'comparison')}:")
-        for result in skipped[:NAMED]:
+        of = counted(skipped + sum(overview.compared), "comparison")
+        console.print(f"Skipped {skipped} of {of}:")
+        for result in overview.first_skipped:
             console.print(f"  {result.frame} of {result.test}: {result.skipped}")
-        if len(skipped) > NAMED:
-            console.print(f"  and {len(skipped) - NAMED} more, in {TABLE}")
-    if exceeded:
-        worst = max(exceeded, key=lambda result: result.figures["max_jnd"] or 0.0)
+        if skipped > len(overview.first_skipped):
+            console.print(f"  and {skipped - len(overview.first_skipped)} more, in {TABLE}")
+    worst = overview.worst
+    if exceeded and worst is not None:
         console.print(
-            f"Over {options.fail_above:g} JND: {counted(len(exceeded), 'comparison')}; the worst "
+            f"Over {options.fail_above:g} JND: {counted(exceeded, 'comparison')}; the worst "
             f"is {worst.frame} of {worst.test}, {worst.figures['max_jnd']:.2f} JND"
         )
     console.print(f"written: {options.output / REPORT}", style="dim")
     return text.getvalue()
 
 
-def _table(tests: Sequence[str], results: Sequence[Result]) -> Any:
+def _table(overview: Overview) -> Any:
     """Return a table of medians over the frames, a line for each test."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
-    names = [name for name in tables.present(results) if name not in NOT_IN_TERMINAL]
+    names = [name for name in overview.values if name not in NOT_IN_TERMINAL]
     grid = Table(box=box.SIMPLE_HEAD, pad_edge=False, title="Median over the frames")
-    for heading in ("test", "frames", "worst", *(tables.FIGURES[name].label for name in names)):
+    for heading in ("test", "frames", "worst", *(FIGURES[name].label for name in names)):
         grid.add_column(heading, justify="left" if heading == "test" else "right")
-    for test in tests:
-        done = [result for result in results if result.test == test and not result.skipped]
-        cells = [test, str(len(done))]
-        largest = [value for r in done if (value := r.figures["max_jnd"]) is not None]
-        cells.append(f"{max(largest):.2f}" if largest else "")
+    for test, count in zip(overview.tests, overview.compared, strict=True):
+        cells = [test, str(count), f"{overview.column('max_jnd', test).max():.2f}" if count else ""]
         for name in names:
-            values = [value for r in done if (value := r.figures.get(name)) is not None]
-            cells.append(shown(name, float(np.median(values))) if values else "")
+            values = overview.column(name, test)
+            cells.append(shown(name, float(np.median(values))) if len(values) else "")
         grid.add_row(*(Text(cell) for cell in cells))
     return grid
 
 
 def shown(name: str, value: float) -> str:
     """Return a figure with the digits that it is shown with."""
-    figure = tables.FIGURES[name]
+    figure = FIGURES[name]
     return f"{value:.{figure.digits}%}" if figure.percent else f"{value:.{figure.digits}f}"
 
 

@@ -34,7 +34,7 @@ class EvaluationError(ValueError):
         super().__init__(printable(message))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Job:
     """One frame of one test, and the files to compare.
 
@@ -48,8 +48,12 @@ class Job:
     path: Path
     before: tuple[Path, Path] | None = None
 
+    def __str__(self) -> str:
+        """Return what it is called in messages."""
+        return f"{self.frame} of {self.test}"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, slots=True)
 class Missing:
     """A frame of a test that cannot be compared, and why."""
 
@@ -164,12 +168,22 @@ def _found(place: str, output: Path) -> dict[str, list[Path]]:
         named = ((path.relative_to(folder).with_suffix("").as_posix(), path) for path in files)
     elif WILDCARDS.search(place):
         named = _by_pattern(place)
+    elif folder.is_file():
+        raise EvaluationError(
+            f"{place}: expected a folder or a pattern, got a file; name its folder, or compare two "
+            "files with torch-vdm compare"
+        )
     else:
         raise EvaluationError(
             f"{place}: expected a folder, or a pattern such as '{place}/*.exr', got neither; "
             "check the name"
         )
     inside = output.resolve()
+    if inside in (folder.resolve(), *folder.resolve().parents):
+        raise EvaluationError(
+            f"{place}: expected images outside the output folder, got those in {output}, which "
+            "holds results; name another --output"
+        )
     frames: dict[str, list[Path]] = {}
     for name, path in sorted(named):
         is_image = path.suffix.lower() in SUFFIXES and path.is_file()

@@ -3,7 +3,7 @@
 import json
 import os
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -34,7 +34,7 @@ class Result:
     skipped
         Why it could not be compared; empty where it was.
     figures
-        By name, as in `torch_vdm.evaluate.tables.FIGURES`; None where one has no value.
+        By name, as in `torch_vdm.evaluate.figures.FIGURES`; None where one has no value.
     size
         Width and height in pixels.
     max_pixel
@@ -74,16 +74,31 @@ class Result:
         return json.dumps(fields | {CHECK: check}).encode() + b"\n"
 
 
-class Journal:
-    """The journal of an output folder, open for more; use it in a ``with`` statement."""
+class Journal(Mapping[tuple[str, str], Result]):
+    """The journal of an output folder; use it in a ``with`` statement.
+
+    It has the last result of each frame and test, and takes more. A torn last line, and one that
+    was damaged or that another version wrote, count for nothing. Of a result only its place in the
+    file is held in memory.
+    """
 
     def __init__(self, folder: Path) -> None:
-        path = folder / NAME
+        self._path = folder / NAME
+        self._places: dict[tuple[str, str], int] = {}
         try:
-            _drop_torn_line(path)
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+            _drop_torn_line(self._path)
+            self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+            self._lines = self._path.open("rb")
         except OSError as error:
-            raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from error
+            raise ImageError(
+                f"{self._path}: cannot be written: {error.strerror or error}"
+            ) from error
+        place = 0
+        for line in self._lines:
+            result = _parsed(line)
+            if result is not None:
+                self._places[result.frame, result.test] = place
+            place += len(line)
 
     def __enter__(self) -> Self:
         """Return the journal."""
@@ -97,40 +112,56 @@ class Journal:
     ) -> None:
         """Close the file."""
         os.close(self._file)
+        self._lines.close()
+
+    def __getitem__(self, key: tuple[str, str]) -> Result:
+        """Return the last result of a frame and a test."""
+        self._lines.seek(self._places[key])
+        result = _parsed(self._lines.readline())
+        if result is None:
+            raise ImageError(f"{self._path}: was changed by another program; run again")
+        return result
+
+    def __iter__(self) -> Iterator[tuple[str, str]]:
+        """Return the frames and tests, in the order in which they came first."""
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self._places)
 
     def add(self, result: Result) -> None:
         """Append a result; it is on the disk when this returns."""
-        line = result.line()
-        while line:
-            line = line[os.write(self._file, line) :]
+        line = rest = result.line()
+        while rest:
+            rest = rest[os.write(self._file, rest) :]
         os.fsync(self._file)
+        # Where the end is now: nobody else writes, but if somebody did he would only have added.
+        end = os.lseek(self._file, 0, os.SEEK_CUR)
+        self._places[result.frame, result.test] = end - len(line)
 
 
-def read(folder: Path) -> dict[tuple[str, str], Result]:
-    """Return the last result of each frame and test in the journal of a folder.
+class Selection:
+    """Results of a journal by their frames and tests, read each time they are gone through."""
 
-    A torn last line, and one that was damaged or that another version wrote, count for nothing.
-    """
-    return {(result.frame, result.test): result for result in _results(folder / NAME)}
+    def __init__(
+        self, journal: Mapping[tuple[str, str], Result], keys: Sequence[tuple[str, str]]
+    ) -> None:
+        self._journal, self._keys = journal, keys
+
+    def __iter__(self) -> Iterator[Result]:
+        """Read one after another."""
+        return (self._journal[key] for key in self._keys)
 
 
-def _results(path: Path) -> Iterator[Result]:
+def _parsed(line: bytes) -> Result | None:
+    """Return the result of a line; None of one that counts for nothing."""
     try:
-        file = path.open("rb")
-    except FileNotFoundError:
-        return
-    with file:
-        for line in file:
-            if not line.endswith(b"\n"):
-                return
-            try:
-                fields: Any = json.loads(line)
-                check = fields.pop(CHECK)
-                result = Result(**fields) if check == _checksum(json.dumps(fields)) else None
-            except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
-                continue
-            if result is not None:
-                yield result
+        fields: Any = json.loads(line)
+        check = fields.pop(CHECK)
+        return Result(**fields) if check == _checksum(json.dumps(fields)) else None
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+        return None
 
 
 def _checksum(text: str) -> int:

@@ -250,10 +250,17 @@ def map_paths(output: Path, frame: str, test: str) -> tuple[Path, Path]:
 def settings(options: argparse.Namespace) -> dict[str, object]:
     """Return the options on which figures depend."""
     return {
-        name: value if isinstance(value, bool | int | float | str | None) else str(value)
+        name: _plain(value)
         for name, value in sorted(vars(options).items())
         if name not in NOT_SETTINGS
     }
+
+
+def _plain(value: object) -> object:
+    """Return an option's value as JSON and a reader can have it."""
+    if isinstance(value, list):
+        return ",".join(value)
+    return value if isinstance(value, bool | int | float | str | None) else str(value)
 
 
 def _content(path: Path) -> str:
@@ -284,6 +291,7 @@ def _luminance_change(reference: Tensor, test: Tensor) -> float | None:
     """Return how much brighter the test is, relative; None beside a black reference."""
     weights = torch.tensor(BT709_TO_XYZ[1], dtype=torch.float64)
     one, other = (
-        (image.double().mean((1, 2)) * weights).sum().item() for image in (reference, test)
+        (image.mean((1, 2), dtype=torch.float64) * weights).sum().item()
+        for image in (reference, test)
     )
     return other / one - 1.0 if one > 0.0 else None

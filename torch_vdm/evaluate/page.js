@@ -4,7 +4,7 @@
 const data = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);
 const COLOURS = ["#2f7ed8", "#d9822b", "#2a9d5c", "#b0479e", "#8a6d3b", "#d1495b", "#00838f", "#6a5acd"];
-const DASHES = ["", "6 3", "2 3", "8 3 2 3"];
+const DASHES = ["", "6 3", "2 3"], STROKES = ["solid", "dashed", "dotted"];
 const PAGE = 200; // rows of the table that are shown at once
 const KEPT = 9; // decoded pictures, and layers drawn from them, that are kept
 const rows = data.rows.map((row, number) => ({
@@ -114,7 +114,7 @@ function showCourse() {
       for (const row of own) svg.append(drawn("circle", { cx: x(row.frame), cy: y(maximum(row)), r: 2.5, fill: colour }));
     }
     const entry = element("span");
-    entry.append(element("i", null, { style: `background:${colour}` }), test);
+    entry.append(element("i", null, { style: `border-top:3px ${STROKES[number % STROKES.length]} ${colour}` }), test);
     $("legend").append(entry);
   });
   svg.addEventListener("click", (event) => {

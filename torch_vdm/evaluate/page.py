@@ -3,22 +3,24 @@
 import base64
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib.resources import files
+from itertools import chain
 from pathlib import Path
 
 from torch_vdm.evaluate import maps, pictures
+from torch_vdm.evaluate.figures import FIGURES
 from torch_vdm.evaluate.journal import Result
 from torch_vdm.evaluate.judge import MAPS, PICTURES
-from torch_vdm.evaluate.tables import FIGURES, present
+from torch_vdm.evaluate.overview import Overview
 from torch_vdm.io import atomic_path
 from torch_vdm.report import SMALLEST_SCALE
 
 
 def write(
     path: Path,
-    tests: Sequence[str],
-    results: Sequence[Result],
+    overview: Overview,
+    results: Iterable[Result],
     sentences: Sequence[str],
     settings: dict[str, object],
     assumptions: Sequence[str],
@@ -29,10 +31,8 @@ def write(
     ----------
     path
         The page; maps and pictures lie in folders beside it.
-    tests
-        Their names, in order.
-    results
-        All, frame by frame.
+    overview, results
+        All results, frame by frame.
     sentences
         What is said of the tests beside one another.
     settings
@@ -40,12 +40,10 @@ def write(
     assumptions
         What was assumed for all frames, one sentence each.
     """
-    names = present(results)
+    tests, names = overview.tests, list(overview.values)
     data = {
         "tests": list(tests),
         "figures": [{"name": name, **FIGURES[name]._asdict()} for name in names],
-        "rows": [_row(result, tests, names) for result in results if not result.skipped],
-        "skipped": [[r.frame, r.test, r.skipped] for r in results if r.skipped],
         "sentences": list(sentences),
         "settings": [
             [name, str(value)] for name, value in settings.items() if value not in (None, "")
@@ -59,20 +57,38 @@ def write(
         "maps": MAPS,
         "pictures": PICTURES,
     }
+    rows = (_row(result, tests, names) for result in results if not result.skipped)
+    skipped = ([r.frame, r.test, r.skipped] for r in results if r.skipped)
     package = files("torch_vdm.evaluate")
-    parts = {
-        "title": html.escape("Visible differences: " + ", ".join(tests)),
-        "style": (package / "page.css").read_text("utf-8"),
-        "script": (package / "page.js").read_text("utf-8"),
-        "data": _in_script(data),
+    parts: dict[str, Iterable[str]] = {
+        "title": [html.escape("Visible differences: " + ", ".join(tests))],
+        "style": [(package / "page.css").read_text("utf-8")],
+        "data": chain(
+            [_in_script(data)[:-1], ',"rows":['],
+            _listed(rows),
+            ['],"skipped":['],
+            _listed(skipped),
+            ["]}"],
+        ),
+        "script": [(package / "page.js").read_text("utf-8")],
     }
     text = (package / "page.html").read_text("utf-8")
-    for name, part in parts.items():
-        before, mark, after = text.partition(f"<!-- {name} -->")
-        assert mark, name
-        text = before + part + after
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(text.encode(errors="backslashreplace"))
+    with (
+        atomic_path(path) as temporary,
+        temporary.open("w", encoding="utf-8", errors="backslashreplace") as file,
+    ):
+        for name, part in parts.items():
+            before, mark, text = text.partition(f"<!-- {name} -->")
+            assert mark, name
+            file.write(before)
+            file.writelines(part)
+        file.write(text)
+
+
+def _listed(values: Iterable[object]) -> Iterator[str]:
+    """Yield the elements of a list in JSON."""
+    for number, value in enumerate(values):
+        yield ("," if number else "") + _in_script(value)
 
 
 def _row(result: Result, tests: Sequence[str], names: Sequence[str]) -> list[object]:

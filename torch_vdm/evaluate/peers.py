@@ -72,8 +72,10 @@ def judged(
 
 
 def _psnr(test: Tensor, reference: Tensor) -> float | None:
-    error = (test.double() - reference.double()).square().mean().item()
-    return -10.0 * math.log10(error) if error > 0.0 else None
+    difference = test - reference
+    # Its squares are summed in float64 as they are made, without a copy.
+    error = torch.linalg.vector_norm(difference, dtype=torch.float64).item() ** 2
+    return -10.0 * math.log10(error / difference.numel()) if error > 0.0 else None
 
 
 def _ssim(test: Tensor, reference: Tensor) -> float:

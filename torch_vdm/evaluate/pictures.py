@@ -38,6 +38,8 @@ THUMBNAIL = 320
 # Hundredths of a JND: what the page prints. Status: choice.
 STEPS = 100
 
+# Of a picture of light; what is darker is black. With it 2^(8 - e) is a float. Status: derived.
+SMALLEST_EXPONENT = -119
 
 Bytes = NDArray[np.uint8]
 
@@ -106,11 +108,19 @@ def path_of(folder: Path, name: str) -> Path:
 
 def _with_common_exponent(light: NDArray[np.float32]) -> Bytes:
     """Return bytes of R, G, B and their exponent (4, H, W): Radiance's RGBE, value for value."""
-    light = np.maximum(light, 0.0)
-    _, exponent = np.frexp(light.max(0))
-    exponent = np.clip(exponent, -127, 127)
-    mantissas = np.minimum(np.rint(np.ldexp(light, 8 - exponent)), 255.0)
-    return np.concatenate([mantissas, exponent[None] + 128]).astype(np.uint8)
+    light = np.maximum(light, np.float32(0.0))
+    largest = light.max(0)
+    # As `numpy.frexp` and `ldexp` would, which take several times as long: the exponent of a float
+    # is in its bits, and a power of two is made of it.
+    exponent = (largest.view(np.int32) >> 23) - 126
+    exponent = np.clip(np.where(largest == 0.0, 0, exponent), SMALLEST_EXPONENT, 127)
+    power = ((8 - exponent + 127) << 23).astype(np.int32).view(np.float32)
+    coded = np.empty((4, *largest.shape), np.uint8)
+    for plane, channel in zip(coded[:3], light, strict=True):
+        scaled = channel * power
+        plane[...] = np.minimum(np.rint(scaled, out=scaled), 255.0, out=scaled)
+    coded[3] = exponent + 128
+    return coded
 
 
 def _write(folder: Path, kind: str, planes: Bytes) -> str:

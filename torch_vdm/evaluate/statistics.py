@@ -1,7 +1,6 @@
 """Which of two tests is better, from the same frames of both."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -76,30 +75,26 @@ class Paired:
         )
 
 
-def compare(
-    one: str, other: str, figure: str, values: Sequence[tuple[float, float]], seed: int = 0
-) -> Paired:
+def compare(one: str, other: str, figure: str, pairs: Floats, seed: int = 0) -> Paired:
     """Compare two tests by a figure of the frames that both have.
 
     Parameters
     ----------
     one, other, figure
         Names.
-    values
-        The figure of ``one`` and of ``other``, a pair for each frame.
+    pairs
+        The figure of ``one`` and of ``other`` (frames, 2), of one frame at least.
     seed
         Of the bootstrap: the same values give the same interval.
     """
-    pairs = np.array(values, np.float64).reshape(-1, 2)
     differences: Floats = pairs[:, 1] - pairs[:, 0]
-    median = float(np.median(differences)) if len(differences) else 0.0
     return Paired(
         one,
         other,
         figure,
         len(differences),
-        median,
-        interval(differences, seed) if len(differences) else (0.0, 0.0),
+        float(np.median(differences)),
+        interval(differences, seed),
         int((differences < 0.0).sum()),
         int((differences > 0.0).sum()),
     )
@@ -127,7 +122,11 @@ def counted(number: int, what: str) -> str:
 
 
 def _range(low: float, high: float, sign: str = "") -> str:
-    """Return a range of numbers with as many digits as tell two of the smaller one's."""
+    """Return a range with two digits of the smaller number, and more where the ends need them."""
     smallest = min((abs(end) for end in (low, high) if end), default=1.0)
     digits = max(0, 1 - math.floor(math.log10(smallest)))
-    return f"{low:{sign}.{digits}f} to {high:{sign}.{digits}f}"
+    for more in range(digits, digits + 3):
+        ends = f"{low:{sign}.{more}f}", f"{high:{sign}.{more}f}"
+        if ends[0] != ends[1]:
+            return " to ".join(ends)
+    return f"{low:{sign}.{digits}f}"

@@ -1,9 +1,7 @@
 """Jobs worked through by several processes, any of which may die."""
 
-import signal
-import threading
-from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
@@ -11,6 +9,7 @@ from typing import NamedTuple
 
 import torch
 
+from torch_vdm.cluster import no_interrupts
 from torch_vdm.evaluate.frames import Job
 from torch_vdm.evaluate.journal import Result
 from torch_vdm.evaluate.judge import Judge
@@ -122,19 +121,6 @@ def _died(connection: Connection, hand: _Hand) -> Result:
     )
     _end(connection, hand)
     return Result(frame=hand.job.frame, test=hand.job.test, skipped=printable(why))
-
-
-@contextmanager
-def no_interrupts() -> Iterator[None]:
-    """Let processes that are started here never see Ctrl-C, which is this process's to answer."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _work(connection: Connection, judge: Judge, threads: int) -> None:
