@@ -41,7 +41,7 @@ FEWEST_SAMPLES, FEWEST_PIXELS, MOST_PIXELS = 16, 2**18, 2**20
 
 # Before it, one sample each of about so many pixels says whether a cut could save anything, and
 # would not show at once: by the mean of the picture, of which at some place there is more. Status:
-# choice; measured, what a bound was over the mean's difference: 4 to 10 on dim rooms and open scenes.
+# choice; a bound was 4 to 10 times the mean's difference on dim rooms and open scenes.
 GLANCED, LOCAL = 2**13, 4.0
 
 # Samples grow by this power of the tolerance as it falls. Status: measured, the Cornell box from 2
