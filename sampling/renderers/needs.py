@@ -57,7 +57,9 @@ def read(mi: Any, scene: Any, sensor: Any, integrator: Any) -> Needs:
         name = None
     most = int(depth.group(1)) if depth is not None else 0
     shapes = scene.shapes()
-    bsdfs = [shape.bsdf() for shape in shapes if shape.bsdf() is not None]
+    # Once each, for many shapes share a material.
+    every = [shape.bsdf() for shape in shapes if shape.bsdf() is not None]
+    bsdfs = list({bsdf.ptr: bsdf for bsdf in every}.values())
     flags = [int(bsdf.flags()) for bsdf in bsdfs]
     null, delta = int(mi.BSDFFlags.Null), int(mi.BSDFFlags.Delta)
     return Needs(
