@@ -12,8 +12,8 @@ BENCHMARKS = {
     "calibrate": "fit the observer to human thresholds; 15 minutes, 1 with --quick",
     "denoisers": "what Open Image Denoise and others leave visible; 15 minutes, 30 seconds with "
     "--quick",
-    "effects": "what each effect costs, and what leaving it out shows; 5 minutes, 10 seconds with "
-    "--quick",
+    "effects": "what each effect costs, of the metric and of light, and what leaving it out shows; "
+    "20 minutes, 30 seconds with --quick",
     "evaluate": "what many frames cost beside the metric, and what they hold; 20 minutes, "
     "1 with --quick",
     "large": "memory on images up to 16,384 x 16,384; 15 minutes, 15 seconds with --quick",
@@ -31,6 +31,13 @@ BENCHMARKS = {
     "training": "a denoiser trained with each loss; 30 minutes, 30 seconds with --quick",
 }
 
+# Those that come in parts.
+PARTS = {"accuracy": ("errors", "times"), "effects": ("metric", "renderer")}
+
+
+def _parts() -> str:
+    return "; ".join(f"of {name}: {', '.join(parts)}" for name, parts in PARTS.items())
+
 
 def main() -> int:
     parser = argparse.ArgumentParser(
@@ -47,12 +54,10 @@ def main() -> int:
         metavar="DIR",
         help="where to write; without it, benchmarks/results, and with --quick nothing is written",
     )
-    parser.add_argument(
-        "--part", choices=("errors", "times"), help="of accuracy: measure this and keep the other"
-    )
+    parser.add_argument("--part", help=f"measure this and keep the rest: {_parts()}")
     options = parser.parse_args()
-    if options.part is not None and options.name != "accuracy":
-        parser.error("--part is for accuracy")
+    if options.part is not None and options.part not in PARTS.get(options.name, ()):
+        parser.error(f"expected a part that there is, {_parts()}, got {options.part!r}")
     output = options.output
     if output is None and not options.quick:
         output = Path(__file__).parent / "results"

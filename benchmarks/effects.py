@@ -2,7 +2,7 @@
 
 For each effect, the map's time with and without it, and the largest difference that it makes
 anywhere; for each pair, everything against `effects="auto"`. Times are medians of interleaved
-rounds: every round runs each contender once.
+rounds: every round runs each contender once. The renderer's half is `benchmarks.transport`.
 """
 
 import statistics
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from benchmarks import record
+from benchmarks import record, transport
 from benchmarks.pictures import distorted, grainy, photographs, renders
 from torch_vdm import VDM, Effects
 
@@ -132,7 +132,14 @@ def of_pair(pair: Pair, rounds: int) -> dict[str, Any]:
     }
 
 
-def run(quick: bool, output: Path | None) -> None:
+def run(quick: bool, output: Path | None, part: str | None = None) -> None:
+    if part != "renderer":
+        run_metric(quick, output)
+    if part != "metric":
+        transport.run(quick, output)
+
+
+def run_metric(quick: bool, output: Path | None) -> None:
     torch.set_num_threads(THREADS)
     size = QUICK if quick else SIZE
     found = {}

@@ -93,7 +93,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     view.add_argument("--observer", choices=tuple(OBSERVERS), default="calibrated")
     scene = parser.add_argument_group("scene")
-    scene.add_argument("--effects", choices=tuple(EFFECTS), default="auto")
+    scene.add_argument(
+        "--effects",
+        choices=EFFECTS,
+        default=EFFECTS[0],
+        help="auto: leave out what nobody could see; full: nothing (auto)",
+    )
     scene.add_argument(
         "--aov",
         action="store_true",
@@ -354,6 +359,11 @@ def _text(figures: dict[str, Any], options: argparse.Namespace) -> str:
     lines += [
         f"simulated: {plan['integrator']}, {depth}, {figures['variant']}, "
         f"{plan['pixel_filter']} filter" + "".join(f", {effect}" for effect in simulated),
+        *(
+            f"{what}: {each}"
+            for what in ("left out", "kept")
+            for each in plan[what.replace(" ", "_")]
+        ),
         f"assumed: {options.ppd:g} pixels per degree (--ppd)",
         f"assumed: 1.0 is {options.white:g} cd/m2 (--white)",
         f"assumed: the {options.observer} observer (--observer)",

@@ -27,8 +27,8 @@ def register_integrator() -> None:
     """Make the integrator ``vdm`` known to the variant of Mitsuba that is set.
 
     Its parameters are those of `render` that a scene may state: ``tolerance`` (JND), ``ppd`` and
-    ``white`` (cd/m2), floats; ``strategy`` and ``filter``, strings; ``unbiased``, a boolean; and
-    Mitsuba's ``timeout`` in seconds. In it is the integrator that gives the light.
+    ``white`` (cd/m2), floats; ``strategy``, ``filter`` and ``effects``, strings; ``unbiased``, a
+    boolean; and Mitsuba's ``timeout`` in seconds. In it is the integrator that gives the light.
 
     In `mi.render`, ``seed`` and ``sensor`` are what they are elsewhere. ``spp`` is the most samples
     that a pixel may get; 0: as many as it takes, for the sampler of the scene, with its number of
@@ -70,6 +70,7 @@ def register_integrator() -> None:
                     ("white", 100.0),
                     ("strategy", "perceptual"),
                     ("filter", SCENE),
+                    ("effects", "auto"),
                     ("unbiased", False),
                 )
             }

@@ -252,6 +252,34 @@ class Model:
         self._correct(torch.cat(visible).mean(0, keepdim=True))
         return largest
 
+    @torch.no_grad()
+    def largest_without(self, part: Statistics) -> float:
+        """Return the visible difference that leaving out a part of the light makes, JND.
+
+        Exceeded in few runs, as `predicted_maximum` is. What is left out is simulated: the mean of
+        its samples, with noise of the estimated covariance of that mean once more, which is in the
+        mean already; it is taken off the image as plain as it may be, which hides least.
+
+        Parameters
+        ----------
+        part
+            Of the part of each sample that is left out, as many samples as ``statistics`` has.
+        """
+        factor = _factor(torch.from_numpy(pooled_covariance(part, self.size) / self.count))
+        mixing = torch.einsum("ij,jkhw->ikhw", self.to_cones, factor).float()
+        mean = torch.from_numpy(part.mean.reshape(3, *self.size))
+        known = torch.einsum("ij,jhw->ihw", self.to_cones, mean).float()
+        generator = torch.Generator().manual_seed(0)
+        seen = self._judge(self.truth)
+        largest = np.empty(FEWEST_DRAWS)
+        for number in range(FEWEST_DRAWS):
+            self._look()
+            normal = torch.randn(1, *known.shape, generator=generator, dtype=torch.float32)
+            missing = known + mix(mixing, normal)
+            totals = seen(self.metric.transform.decompose(-missing, true_means=self.true_means))
+            largest[number] = float(totals.amax()) ** (1.0 / self.exponent)
+        return _upper(largest)
+
     def _judge(self, truth: Cortex) -> Callable[[Cortex], Tensor]:
         """Return what finds the totals, (B, 1, h, w), that noises add to an image."""
         first = _each(truth, Tensor.float)
@@ -290,9 +318,7 @@ class Model:
 
         Less exactly where it is over ``tolerance``; see `simulated`.
         """
-        largest = self.simulated(tolerance=tolerance)
-        mean = float(largest.mean())
-        return mean + QUANTILE * math.hypot(float(largest.std(ddof=1)), INEXACT * mean)
+        return _upper(self.simulated(tolerance=tolerance))
 
     def _cone_variance(self) -> Tensor:
         """Return the variance of a single sample of each pixel in S, M, L, (1, 3, H, W).
@@ -304,6 +330,12 @@ class Model:
         weights = matrix[:, FIRST] * matrix[:, SECOND] * np.where(FIRST == SECOND, 1.0, 2.0)
         variance = np.einsum("ck,khw->chw", weights, self.single)
         return torch.from_numpy(np.clip(variance, 0.0, LARGEST))[None]
+
+
+def _upper(largest: NDArray[np.float64]) -> float:
+    """Return what the largest difference exceeds in few runs, from simulated ones."""
+    mean = float(largest.mean())
+    return mean + QUANTILE * math.hypot(float(largest.std(ddof=1)), INEXACT * mean)
 
 
 def _finest(local: tuple[Tensor, ...], grid: Grid) -> Tensor:

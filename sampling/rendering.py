@@ -8,7 +8,7 @@ import json
 import os
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ import torch
 from numpy.typing import NDArray
 
 from sampling import checkpoint as checkpoints
+from sampling import plan as plans
+from sampling.plan import AUTO, FULL, Pilot, Plan
 from sampling.renderers.filter import SCENE
 from sampling.renderers.mitsuba import MitsubaRenderer, preserved
 from sampling.sampler import Report, Sampler, Settings, StrategyName, under
@@ -43,11 +45,8 @@ FEW_PIXELS = 2**18
 # Seconds between two changes of the live line.
 LINE_SECONDS = 0.2
 
-# What `effects` may be, and why what is simulated is simulated.
-EFFECTS = {
-    "auto": "nothing is left out yet: what the scene names is simulated",
-    "full": "asked for: what the scene names is simulated",
-}
+# What `effects` may be.
+EFFECTS = (AUTO, FULL)
 
 
 class Watch:
@@ -101,7 +100,7 @@ class Result:
 
         Its channels: R, G, B, and A where the scene's film has it; samples; jnd; variance.R, .G,
         .B; albedo.R, .G, .B, normal.X, .Y, .Z and depth.Z where they were asked. Its header names
-        the reconstruction filter, as ``pixelFilter``.
+        the reconstruction filter, as ``pixelFilter``, and what was left out, as ``plan``.
 
         Raises
         ------
@@ -184,7 +183,7 @@ def render(
         The pixels' reconstruction filter: "scene", the film's own, or box, tent, gaussian,
         mitchell, catmullrom or lanczos.
     effects
-        "auto" or "full"; nothing is left out yet.
+        "auto": what nobody could see is left out, see `sampling.plan`; "full": nothing is.
     observer
         Who judges; None: `Observer.calibrated`.
     strategy, max_spp, noise_threshold, unbiased
@@ -262,11 +261,15 @@ def render(
             "aov": aov,
             "filter": filter,
         }
-        run = _Run(renderer, Sampler(renderer.size, metric, settings), identity, begun)
+        plan, piloted = plans.read(renderer.needs, effects, settings, renderer.size)
+        sampler = Sampler(renderer.size, metric, settings)
+        run = _Run(renderer, sampler, identity, begun, effects, plan, piloted)
         if checkpoint is not None or resume is not None:
             run.check_kept()
         if resume is not None:
             run.go_on(Path(resume))
+        if run.plan.integrator is not None:
+            renderer.simulate(run.plan.max_depth)
         few = height * width < FEW_PIXELS
         with (
             _threads(1 if few else torch.get_num_threads()),
@@ -276,7 +279,7 @@ def render(
             reason = run.until_done(told, time_limit or np.inf, checkpoint)
         if checkpoint is not None:
             run.save(Path(checkpoint))
-        return run.result(reason, effects)
+        return run.result(reason)
 
 
 class _EndedError(Exception):
@@ -296,6 +299,10 @@ class _Run:
     identity: dict[str, Any]
     begun: float
     """When this part of the run began, by the monotonic clock."""
+    effects: str
+    plan: Plan
+    piloted: bool
+    """Whether a pilot is still to say more of the plan."""
     samples: int = 0
     seconds: dict[str, float] = field(
         default_factory=lambda: dict.fromkeys(("render", "metric", "total"), 0.0)
@@ -317,6 +324,9 @@ class _Run:
         if self.renderer.aov_sums is not None:
             state["aov_sums"] = self.renderer.aov_sums
         state["progress.samples"] = self.samples
+        state["plan"] = json.dumps(
+            {"effects": self.effects, "piloted": self.piloted, "plan": self.plan.state()}
+        )
         for name, seconds in (self.seconds | {"total": self._total()}).items():
             state[f"progress.seconds_{name}"] = seconds
         checkpoints.save(path, checkpoints.Checkpoint(self.identity, state))
@@ -328,6 +338,10 @@ class _Run:
             return
         state = checkpoints.load(path, self.identity)
         try:
+            begun = json.loads(state["plan"])
+            if begun["piloted"]:
+                return  # it ended within the pilot, of which nothing is kept
+            self._take_over(path, begun)
             self.sampler = Sampler.restore(under("sampler.", state), self.sampler.metric)
             self.samples = state["progress.samples"]
             self.seconds = {name: state[f"progress.seconds_{name}"] for name in self.seconds}
@@ -339,11 +353,55 @@ class _Run:
                 "start anew without --resume"
             ) from error
 
+    def _take_over(self, path: Path, begun: dict[str, Any]) -> None:
+        """Take over the plan of a checkpoint, or refuse it where another one would be made."""
+        plan = Plan.restored(begun["plan"])
+        if begun["effects"] != self.effects:
+            # What has been kept whole so far may be so further on.
+            if plan.integrator is not None or self.plan.integrator is not None:
+                raise checkpoints.CheckpointError(
+                    f"{path}: begun with --effects {begun['effects']}, and this is {self.effects}; "
+                    "give the same, or start anew without --resume"
+                )
+        else:
+            self.plan = plan
+        self.piloted = False
+
+    def report(self) -> Report | None:
+        """Return what the last decision saw, and what is left out with it."""
+        report, bound = self.sampler.report(), self.plan.bound
+        if report is None or not bound:
+            return report
+        return report._replace(predicted=report.predicted + bound, jnd=report.jnd + bound)
+
+    def _draw_pilot(
+        self, pilot: Pilot, watch: Watch, ended: Callable[[], str | None]
+    ) -> str | None:
+        """Draw the first round; return why the run ended within it, if it did."""
+        drawn, drawing, start = 0, 0.0, time.perf_counter()
+        for part in pilot.steps():
+            end = time.perf_counter()
+            self.samples += part
+            self.seconds["render"] += end - start
+            drawn, drawing = drawn + part, drawing + end - start
+            watch.part(self.samples, drawn / drawing)
+            if (reason := ended()) is not None:
+                return reason
+            start = time.perf_counter()
+        return None
+
+    def _settle(self, pilot: Pilot) -> None:
+        """Take over what the pilot says of the plan."""
+        start = time.perf_counter()
+        pilot.settle()
+        self.sampler, self.plan, self.piloted = pilot.sampler, pilot.plan, False
+        self.seconds["metric"] += time.perf_counter() - start
+
     def until_done(
         self, watch: Watch, time_limit: float, checkpoint: str | os.PathLike[str] | None
     ) -> str:
         """Render until the sampler, the clock or the user says stop; return the reason."""
-        sampler, seconds = self.sampler, self.seconds
+        seconds = self.seconds
         saved = time.monotonic()
         at_once = FIRST_PART
         drawn, drawing = 0, 0.0
@@ -354,13 +412,17 @@ class _Run:
                 return "interrupted"
             # The first round is always completed: without it there is no image, and no prediction.
             late = time.monotonic() - self.begun > time_limit
-            return "time_limit" if late and sampler.report() is not None else None
+            return "time_limit" if late and self.sampler.report() is not None else None
 
         def look() -> None:
             if (reason := ended()) is not None:
                 raise _EndedError(reason)
 
+        pilot = Pilot(self.plan, self.renderer, self.sampler) if self.piloted else None
+        if pilot is not None and (reason := self._draw_pilot(pilot, watch, ended)) is not None:
+            return reason
         while True:
+            sampler = self.sampler
             start = time.perf_counter()
             try:
                 request = sampler.ask(look)
@@ -368,7 +430,7 @@ class _Run:
                 return ending.reason
             finally:
                 seconds["metric"] += time.perf_counter() - start
-            report = sampler.report()
+            report = self.report()
             watch.round(report)
             if request is None:
                 assert report is not None
@@ -376,6 +438,9 @@ class _Run:
                 return report.stop_reason
             if report is not None and watch.presses():
                 return "interrupted"
+            if pilot is not None and self.piloted:
+                self._settle(pilot)
+                continue
             for part in request.parts(at_once):
                 start = time.perf_counter()
                 samples = self.renderer.sample(part.pixels, part.first, part.count)
@@ -398,9 +463,10 @@ class _Run:
             speed = drawn / drawing
             at_once = int(np.clip(PART_SECONDS * speed, SMALLEST_PART, LARGEST_PART))
 
-    def result(self, reason: str, effects: str) -> Result:
+    def result(self, reason: str) -> Result:
         """Return the picture and what is known of it."""
-        sampler, renderer, report = self.sampler, self.renderer, self.sampler.report()
+        sampler, renderer, report = self.sampler, self.renderer, self.report()
+        plan = self.plan.ended() if self.piloted else self.plan
         height, width = renderer.size
         empty = int((sampler.count == 0).sum())
         # A pixel without a finite sample is black, and nothing is known of it.
@@ -422,7 +488,7 @@ class _Run:
             "seconds_metric": self.seconds["metric"],
             "seconds_total": self._total(),
             "variant": renderer.variant,
-            "plan": {"effects_option": effects, "why": EFFECTS[effects], **renderer.plan()},
+            "plan": {"effects_option": self.effects, **plan.figures(), **renderer.plan()},
             "samples_min": int(sampler.count.min()),
             "samples_max": int(sampler.count.max()),
             "nonfinite": report.nonfinite if report is not None else 0,
@@ -451,6 +517,7 @@ class _Run:
             header={
                 "software": f"vdm-render {__version__}",
                 "pixelFilter": renderer.pixel_filter.words,
+                "plan": "; ".join(plan.words()),
             },
             _run=self,
         )

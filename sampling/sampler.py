@@ -248,6 +248,13 @@ class Sampler:
         """Return what the last decision saw; None before the pilot is complete."""
         return self._report
 
+    def largest_without(self, part: Statistics) -> float:
+        """Return the visible difference that leaving out a part of the light makes, JND.
+
+        ``part`` is what is left out of each sample so far; see `Model.largest_without`.
+        """
+        return Model(self.metric, self._statistics, self.size).largest_without(part)
+
     @property
     def image(self) -> Plane:
         """(H, W, 3), the mean of the finite samples, linear BT.709; 0 where there are none."""

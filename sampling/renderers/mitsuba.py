@@ -16,14 +16,16 @@ import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sampling.renderers import hemisphere
+from sampling.renderers import bounces, hemisphere
 from sampling.renderers.filter import FILTERS, SCENE, PixelFilter
 from sampling.renderers.llvm import OLDEST, PACKAGE, VARIABLE, find_llvm
+from sampling.renderers.needs import PATH, Needs
+from sampling.renderers.needs import read as read_needs
 from sampling.renderers.protocol import Samples
 
 # In the order of preference; all compute in linear BT.709.
@@ -50,6 +52,16 @@ LIT = ("path", "direct", "vol")
 
 class SceneError(ValueError):
     """A scene that cannot be rendered; the message is one line."""
+
+
+class Bounced(NamedTuple):
+    """Samples, and what they would be were no path longer than so many segments."""
+
+    samples: Samples
+    within: NDArray[np.float32]
+    """(N, 3)."""
+    segments: NDArray[np.float32]
+    """(N,), how many path segments were looked for."""
 
 
 class MitsubaRenderer:
@@ -162,17 +174,14 @@ class MitsubaRenderer:
         )
         self._alpha: bool = film.flags() & int(self._mi.FilmFlags.Alpha) != 0
         self.planes = [ALPHA] if self._alpha else []
+        self.needs: Needs = read_needs(self._mi, self._scene, self._sensor, self._integrator)
+        self._aov = aov
         own = self._integrator.aov_names()
-        # In what the integrator gives: where what is wanted begins.
+        self.planes += own if aov == OWN else AOV_NAMES if aov else ()
+        # In what the integrator gives: where what is wanted begins, and what is told of paths.
         self._aov_at = 0 if aov == OWN else len(own)
-        if aov == OWN:
-            self.planes += own
-        elif aov:
-            self._integrator = self._mi.load_dict(
-                {"type": "aov", "aovs": AOVS, "image": self._integrator}
-            )
-            self._aov_at = len(self._integrator.aov_names()) - len(AOV_NAMES)
-            self.planes += AOV_NAMES
+        self._told = slice(0)
+        self._with_aovs(self._integrator)
         self.aov_sums: NDArray[np.float64] | None = (
             np.zeros((len(self.planes) + 1, width * height)) if self.planes else None
         )
@@ -184,10 +193,64 @@ class MitsubaRenderer:
 
         ``pixels`` is to be sorted: neighbours are traced together.
         """
+        return self._sampled(pixels, first, count)[0]
+
+    def sample_bounces(
+        self,
+        pixels: NDArray[np.int64],
+        first: NDArray[np.int64],
+        count: NDArray[np.int64],
+        cut: int,
+    ) -> Bounced:
+        """Draw the same samples, and tell what each is with no more path segments than ``cut``.
+
+        Of the integrators of `Needs`, without media and in compiled RGB variants only. The samples
+        are those of ``path``, bit for bit, and the shorter ones those of ``path`` of that depth.
+        """
+        before = self._integrator, self._aov_at
+        needs, dr = self.needs, importlib.import_module("drjit")
+        self._mi.set_variant(self.variant)
+        told = bounces.make(self._mi, dr, needs.max_depth, needs.rr_depth, cut)
+        self._aov_at = len(told.aov_names())
+        self._with_aovs(told)
+        self._told = slice(self._aov_at - len(told.aov_names()), self._aov_at)
+        try:
+            samples, beside = self._sampled(pixels, first, count)
+        finally:
+            self._integrator, self._aov_at = before
+            self._told = slice(0)
+        return Bounced(samples, np.stack(beside[:-1], -1), beside[-1])
+
+    def simulate(self, max_depth: int | None) -> None:
+        """Render with ``path`` of so many segments in place of the scene's own integrator."""
+        self._mi.set_variant(self.variant)
+        depth = -1 if max_depth is None else max_depth
+        words = {"type": PATH, "max_depth": depth, "rr_depth": self.needs.rr_depth}
+        self._aov_at = 0
+        self._with_aovs(self._mi.load_dict(words))
+        self._named = PATH, max_depth
+
+    def _with_aovs(self, integrator: Any) -> None:
+        """Render with an integrator, and around it what gives the AOVs that were asked."""
+        self._integrator = integrator
+        if self._aov and self._aov != OWN:
+            self._integrator = self._mi.load_dict(
+                {"type": "aov", "aovs": AOVS, "image": integrator}
+            )
+            self._aov_at = len(self._integrator.aov_names()) - len(AOV_NAMES)
+
+    def _sampled(
+        self, pixels: NDArray[np.int64], first: NDArray[np.int64], count: NDArray[np.int64]
+    ) -> tuple[Samples, list[NDArray[np.float32]]]:
+        """Draw samples, and what is told beside the AOVs."""
         which = np.repeat(np.asarray(pixels, np.int64), count)
         starts = np.cumsum(count) - count
         number = np.arange(len(which)) - np.repeat(starts - first, count)
         radiance = np.empty((len(which), 3), np.float32)
+        beside = [
+            np.empty(len(which), np.float32)
+            for _ in range(self._told.stop - (self._told.start or 0))
+        ]
         self._mi.set_variant(self.variant)  # someone else may have chosen another one
         draw = self._draw_one_by_one if self.variant.startswith("scalar") else self._draw
         at_once = max(self._batch // self.pixel_filter.rays, 1)
@@ -197,10 +260,13 @@ class MitsubaRenderer:
                 radiance[part], aovs = draw(which[part], number[part])
             except RuntimeError as error:
                 raise SceneError(f"{self.name}: {_one_line(error)}") from error
+            averaged, told = aovs[: len(self.planes)], aovs[len(self.planes) :]
+            for plane, found in zip(beside, told, strict=True):
+                plane[part] = found
             if self.aov_sums is not None:
-                for sums, plane in zip(self.aov_sums, [*aovs, None], strict=True):
-                    sums += np.bincount(which[part], plane, len(sums))
-        return Samples(which, radiance)
+                for sums, summand in zip(self.aov_sums, [*averaged, None], strict=True):
+                    sums += np.bincount(which[part], summand, len(sums))
+        return Samples(which, radiance), beside
 
     def _draw(
         self, pixels: NDArray[np.int64], numbers: NDArray[np.int64]
@@ -261,7 +327,12 @@ class MitsubaRenderer:
         )
         planes = [mi.Float(dr.select(valid, 1.0, 0.0))] if self._alpha else []
         planes += aovs[self._aov_at :]
-        return weight * light * place.weight, [plane * place.weight for plane in planes]
+        planes = [plane * place.weight for plane in planes]
+        for i, plane in enumerate(aovs[self._told]):
+            # Light, but for the last, which is a number.
+            light_too = i < len(aovs[self._told]) - 1
+            planes.append(weight[i % 3] * plane * place.weight if light_too else plane)
+        return weight * light * place.weight, planes
 
     def _load_file(self, path: Path, variant: str) -> None:
         """Load a scene from its file."""
