@@ -190,6 +190,31 @@ def test_albedo_normals_and_depth_come_along(still_life: Path) -> None:
     assert 8.8 < aovs["depth.Z"][0, 0] < 1.2 * 8.8
 
 
+@pytest.mark.parametrize("rfilter", ["box", "mitchell"])
+def test_a_sensor_of_one_ray(mitsuba: Any, rfilter: str) -> None:
+    scene = mitsuba.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path"},
+            "sensor": {
+                "type": "radiancemeter",
+                "to_world": mitsuba.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": rfilter}},
+            },
+            "light": {
+                "type": "sphere",
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [1.0, 2.0, 3.0]}},
+            },
+        }
+    )
+    renderer = MitsubaRenderer(scene, aov=True)
+    samples = draw(renderer, 6)
+    np.testing.assert_allclose(samples.radiance, np.tile([[1.0, 2.0, 3.0]], (6, 1)), rtol=1e-6)
+    aovs = renderer.aovs()
+    assert aovs["depth.Z"].item() == pytest.approx(2.0, rel=1e-3)
+    assert aovs["normal.Z"].item() == pytest.approx(1.0, rel=1e-3)
+
+
 def test_radiance_that_is_not_finite_is_handed_on(mitsuba: Any, tmp_path: Path) -> None:
     del mitsuba
     path = tmp_path / "nan.xml"
@@ -234,6 +259,42 @@ def test_the_fingerprint_is_of_everything_that_is_named(mitsuba: Any, tmp_path: 
     assert len(set(seen)) == 5
 
 
+def triangle(size: int) -> str:
+    """Return a mesh, as an OBJ file."""
+    return f"v 0 0 0\nv {size} 0 0\nv 0 {size} 0\nf 1 2 3\n"
+
+
+def test_the_fingerprint_is_of_the_files_that_are_loaded(
+    mitsuba: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, linked, working, named = (tmp_path / name for name in ("own", "linked", "cwd", "named"))
+    for folder in (own, linked, working, named):
+        folder.mkdir()
+    monkeypatch.chdir(working)
+    scene, spectrum = own / "scene.xml", own / "grey.spd"
+    scene.write_text(
+        f'<scene version="3.0.0">{SENSOR}<path value="{named}"/><emitter type="constant"/>'
+        '<shape type="obj"><string name="filename" value="one.obj"/><bsdf type="diffuse">'
+        '<spectrum name="reflectance" filename="grey.spd"/></bsdf></shape></scene>'
+    )
+    spectrum.write_text("400 0.5\n700 0.25\n")
+    (linked / "scene.xml").symlink_to(scene)
+    paths = list(mitsuba.file_resolver())
+
+    # From where it is looked for last to where it is looked for first.
+    for folder in (working, own, linked, named):
+        (folder / "one.obj").write_text(triangle(1))
+        before = MitsubaRenderer(linked / "scene.xml")
+        assert before._scene.bbox().max.x == 1.0
+        (folder / "one.obj").write_text(triangle(2))
+        after = MitsubaRenderer(linked / "scene.xml")
+        assert after._scene.bbox().max.x == 2.0
+        assert after.fingerprint != before.fingerprint
+    spectrum.write_text("400 0.5\n700 0.75\n")
+    assert MitsubaRenderer(linked / "scene.xml").fingerprint != after.fingerprint
+    assert list(mitsuba.file_resolver()) == paths
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -275,7 +336,8 @@ def test_the_fingerprint_is_of_everything_that_is_named(mitsuba: Any, tmp_path: 
         ),
         (
             '<scene version="3.0.0">' + SENSOR.replace('"path"', '"prb"') + "</scene>",
-            "expected an integrator that samples single rays",
+            "expected an integrator that samples single rays, such as path, volpath or direct, "
+            "got prb",
         ),
         (
             f'<scene version="3.0.0">{SENSOR}<shape type="sphere"/></scene>',

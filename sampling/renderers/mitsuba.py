@@ -14,7 +14,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -219,8 +219,15 @@ class MitsubaRenderer:
         # Of two rays the second is taken off.
         radiance, aovs = self._follow(sampler, pixel % width, pixel // width, (ray & 1) == 1)
         dr.eval(radiance, aovs)
-        planes = [np.asarray(plane.numpy()).reshape(-1, rays).sum(1)[:drawn] for plane in aovs]
-        return np.asarray(radiance.numpy()).T.reshape(-1, rays, 3).sum(1)[:drawn], planes
+        # What is the same for all is one number.
+        light, *planes = (
+            np.broadcast_to(plane.numpy(), (*plane.numpy().shape[:-1], rays * len(pixels)))
+            for plane in (radiance, *aovs)
+        )
+        return (
+            light.T.reshape(-1, rays, 3).sum(1)[:drawn],
+            [plane.reshape(-1, rays).sum(1)[:drawn] for plane in planes],
+        )
 
     def _draw_one_by_one(
         self, pixels: NDArray[np.int64], numbers: NDArray[np.int64]
@@ -270,8 +277,9 @@ class MitsubaRenderer:
             what = "a folder or a device" if path.exists() else "no such file"
             raise SceneError(f"{path}: expected a scene of Mitsuba (XML), got {what}")
         self._mi = load_mitsuba(variant)
-        state = self._parse(path)
-        self._scene = self._instantiate(path, state)
+        with _files_of(self._mi, path) as found:
+            state = self._parse(path, found)
+            self._scene = self._instantiate(path, state)
         self._named = _integrator_names(self._mi, state)
 
     def _take(self, scene: Any, variant: str) -> None:
@@ -336,8 +344,11 @@ class MitsubaRenderer:
         self.sensor = int(wanted), named[wanted]
         return sensors[wanted]
 
-    def _parse(self, path: Path) -> Any:
-        """Read the file and what it includes, and hash all of it."""
+    def _parse(self, path: Path, found: Callable[[str], Path]) -> Any:
+        """Read the file and what it includes, and hash all of it.
+
+        ``found``: the file that is loaded where one is named.
+        """
         mi, parser = self._mi, self._mi.parser
         for name in ("config", "filename"):
             if name in self.parameters:
@@ -354,40 +365,29 @@ class MitsubaRenderer:
             raise SceneError(f"{path}: {_one_line(error)}") from error
         if state.root.type != mi.ObjectType.Scene:
             raise SceneError(f"{path}: expected a <scene> as the outermost element")
-        named = sorted(
-            {
-                str(value)
-                for node in state.nodes
-                for _, value in node.props.items()
-                if isinstance(value, str)
-            }
-        )
-        found = [path.parent / name for name in named if name]
+        values = [value for node in state.nodes for _, value in node.props.items()]
+        named = sorted({str(value) for value in values if isinstance(value, str) and value})
         digest = hashlib.sha256()
         for name, value in sorted(self.parameters.items()):
             digest.update(f"{name}={value}\n".encode())
-        for file in [Path(str(file)) for file in included] + [
-            file for file in found if _is_file(file)
-        ]:
-            with file.open("rb") as content:
-                digest.update(hashlib.file_digest(content, "sha256").digest())
+        for file in (*(Path(str(file)) for file in included), *map(found, named)):
+            if _is_file(file):
+                with file.open("rb") as content:
+                    digest.update(hashlib.file_digest(content, "sha256").digest())
+        # Spectra of files have been read already, and the names are gone.
+        for value in values:
+            if hasattr(value, "wavelengths"):
+                digest.update(np.array([value.wavelengths, value.values]).tobytes())
         self.fingerprint = digest.hexdigest()
         return state
 
     def _instantiate(self, path: Path, state: Any) -> Any:
-        """Build the scene; files that it names are looked for in its own folder first."""
-        mi = self._mi
-        config = mi.parser.ParserConfig(mi.variant())
-        resolver = mi.FileResolver(mi.file_resolver())
-        resolver.prepend(os.fspath(path.resolve().parent))
-        before = mi.file_resolver()
-        mi.set_file_resolver(resolver)
+        """Build the scene."""
+        parser = self._mi.parser
         try:
-            return mi.parser.instantiate(config, state)
+            return parser.instantiate(parser.ParserConfig(self._mi.variant()), state)
         except RuntimeError as error:
             raise SceneError(f"{path}: {_one_line(error)}") from error
-        finally:
-            mi.set_file_resolver(before)
 
     def _sampling_integrator(self, other: Any) -> Any:
         """Return the scene's integrator, or another, if light can be asked of it ray by ray."""
@@ -404,7 +404,7 @@ class MitsubaRenderer:
         if not isinstance(integrator, mi.SamplingIntegrator) or "ADIntegrator" in names:
             raise SceneError(
                 f"{self.name}: expected an integrator that samples single rays, such as path, "
-                f"volpath or direct, got {integrator.class_name()}"
+                f"volpath or direct, got {self._named[0]}"
             )
         name = self._named[0]
         if name == "aov":
@@ -569,6 +569,24 @@ def _pixel_sampler(variant: str) -> Any:
     return _sampler_class(variant)()
 
 
+@contextlib.contextmanager
+def _files_of(mi: Any, path: Path) -> Iterator[Callable[[str], Path]]:
+    """Look for what a scene names where Mitsuba does; yield what finds the file of a name.
+
+    In the scene's folder, that of the file it is a link to, the working directory and Mitsuba's
+    own. What the scene adds to them by ``<path>`` is gone afterwards.
+    """
+    before = mi.file_resolver()
+    resolver = mi.FileResolver(before)
+    for folder in (path.resolve().parent, path.absolute().parent):
+        resolver.prepend(os.fspath(folder))
+    mi.set_file_resolver(resolver)
+    try:
+        yield lambda name: Path(str(mi.file_resolver().resolve(name)))
+    finally:
+        mi.set_file_resolver(before)
+
+
 def _is_file(path: Path) -> bool:
     try:
         return path.is_file()
@@ -603,7 +621,7 @@ def _integrator_names(mi: Any, state: Any) -> tuple[str, int | None]:
 
 def _innermost(words: str) -> tuple[str, int | None]:
     """Return the same of an integrator that is loaded, from what Mitsuba says of it."""
-    names = re.findall(r"(\w+?)(?:Integrator)?\[\s", words)
+    names = re.findall(r"(\w+?)(?:Integrator)?\[", words)
     depths = [int(depth) for depth in re.findall(r"max_depth = (\d+)", words)]
     # Without a limit it is the largest number of 32 bits.
     depth = depths[-1] if depths and depths[-1] < 2**31 else None
