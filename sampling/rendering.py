@@ -18,9 +18,10 @@ import torch
 from numpy.typing import NDArray
 
 from sampling import checkpoint as checkpoints
+from sampling.renderers import Samples
 from sampling.renderers.filter import SCENE
 from sampling.renderers.mitsuba import MitsubaRenderer, preserved
-from sampling.sampler import Report, Sampler, Settings, StrategyName, under
+from sampling.sampler import Report, Sampler, Settings, StrategyName, rounds, under
 from torch_vdm import VDM, Display, Observer, __version__
 from torch_vdm.io import atomic_path, write_channels
 from torch_vdm.model.distance import VISIBLE
@@ -163,7 +164,9 @@ def render(
 ) -> Result:
     """Render a scene of Mitsuba until nobody can see what is still missing.
 
-    The same arguments give the same image, bit for bit; ``time_limit`` alone is outside this.
+    The same arguments give the same image, bit for bit; ``time_limit`` alone is outside this, and
+    for images of 2^18 pixels and more the number of threads of torch is one of the arguments: the
+    figures tell it, and a run that goes on from a checkpoint takes the number it began with.
     Mitsuba's variant and log level are afterwards what they were, as are the numbers of threads.
 
     Parameters
@@ -262,14 +265,15 @@ def render(
             "aov": aov,
             "filter": filter,
         }
-        run = _Run(renderer, Sampler(renderer.size, metric, settings), identity, begun)
+        few = height * width < FEW_PIXELS
+        threads = 1 if few else torch.get_num_threads()
+        run = _Run(renderer, Sampler(renderer.size, metric, settings), identity, begun, threads)
         if checkpoint is not None or resume is not None:
             run.check_kept()
         if resume is not None:
             run.go_on(Path(resume))
-        few = height * width < FEW_PIXELS
         with (
-            _threads(1 if few else torch.get_num_threads()),
+            _threads(run.threads),
             _told(watch or Watch(), tolerance) as told,
         ):
             told.begin()
@@ -287,6 +291,43 @@ class _EndedError(Exception):
         self.reason = reason
 
 
+class _Clock:
+    """A renderer whose time is measured, and all other time beside it."""
+
+    def __init__(self, renderer: MitsubaRenderer, seconds: dict[str, float]) -> None:
+        self.size = renderer.size
+        self.speed = 0.0
+        """Samples a second."""
+        self._renderer, self._seconds = renderer, seconds
+        self._before = time.perf_counter()
+        self._drawn, self._drawing = 0, 0.0
+
+    def spent(self, what: str | None) -> float:
+        """Say what the time since the last call went to; None: nothing that is told."""
+        now = time.perf_counter()
+        passed, self._before = now - self._before, now
+        if what is not None:
+            self._seconds[what] += passed
+        return passed
+
+    def sample(
+        self, pixels: NDArray[np.int64], first: NDArray[np.int64], count: NDArray[np.int64]
+    ) -> Samples:
+        """Draw what the renderer draws."""
+        self.spent("metric")
+        samples = self._renderer.sample(pixels, first, count)
+        self._drawing += self.spent("render")
+        self._drawn += len(samples.pixels)
+        self.speed = self._drawn / self._drawing
+        return samples
+
+    def at_once(self) -> int:
+        """Return how many samples to draw between two looks at the clock."""
+        if not self._drawn:
+            return FIRST_PART
+        return int(np.clip(PART_SECONDS * self.speed, SMALLEST_PART, LARGEST_PART))
+
+
 @dataclass
 class _Run:
     """A scene, its sampler, and what the run has cost, over all its interruptions."""
@@ -296,6 +337,8 @@ class _Run:
     identity: dict[str, Any]
     begun: float
     """When this part of the run began, by the monotonic clock."""
+    threads: int
+    """That the metric computes on, on which the last bits depend; a run keeps to them."""
     samples: int = 0
     seconds: dict[str, float] = field(
         default_factory=lambda: dict.fromkeys(("render", "metric", "total"), 0.0)
@@ -317,6 +360,7 @@ class _Run:
         if self.renderer.aov_sums is not None:
             state["aov_sums"] = self.renderer.aov_sums
         state["progress.samples"] = self.samples
+        state["progress.threads"] = self.threads
         for name, seconds in (self.seconds | {"total": self._total()}).items():
             state[f"progress.seconds_{name}"] = seconds
         checkpoints.save(path, checkpoints.Checkpoint(self.identity, state))
@@ -329,7 +373,7 @@ class _Run:
         state = checkpoints.load(path, self.identity)
         try:
             self.sampler = Sampler.restore(under("sampler.", state), self.sampler.metric)
-            self.samples = state["progress.samples"]
+            self.samples, self.threads = state["progress.samples"], state["progress.threads"]
             self.seconds = {name: state[f"progress.seconds_{name}"] for name in self.seconds}
             if self.renderer.aov_sums is not None:
                 self.renderer.aov_sums[:] = state["aov_sums"]
@@ -343,60 +387,45 @@ class _Run:
         self, watch: Watch, time_limit: float, checkpoint: str | os.PathLike[str] | None
     ) -> str:
         """Render until the sampler, the clock or the user says stop; return the reason."""
-        sampler, seconds = self.sampler, self.seconds
+        sampler = self.sampler
         saved = time.monotonic()
-        at_once = FIRST_PART
-        drawn, drawing = 0, 0.0
-
-        def ended() -> str | None:
-            """Return why no more is to be done at all."""
-            if watch.presses() > 1:
-                return "interrupted"
-            # The first round is always completed: without it there is no image, and no prediction.
-            late = time.monotonic() - self.begun > time_limit
-            return "time_limit" if late and sampler.report() is not None else None
+        clock = _Clock(self.renderer, self.seconds)
 
         def look() -> None:
-            if (reason := ended()) is not None:
-                raise _EndedError(reason)
+            """End the run where no more is to be done at all."""
+            if watch.presses() > 1:
+                raise _EndedError("interrupted")
+            # The first round is always completed: without it there is no image, and no prediction.
+            late = time.monotonic() - self.begun > time_limit
+            if late and sampler.report() is not None:
+                raise _EndedError("time_limit")
 
-        while True:
-            start = time.perf_counter()
-            try:
-                request = sampler.ask(look)
-            except _EndedError as ending:
-                return ending.reason
-            finally:
-                seconds["metric"] += time.perf_counter() - start
-            report = sampler.report()
-            watch.round(report)
-            if request is None:
-                assert report is not None
-                assert report.stop_reason is not None
-                return report.stop_reason
-            if report is not None and watch.presses():
-                return "interrupted"
-            for part in request.parts(at_once):
-                start = time.perf_counter()
-                samples = self.renderer.sample(part.pixels, part.first, part.count)
-                middle = time.perf_counter()
-                sampler.tell(samples)
-                end = time.perf_counter()
-                self.samples += part.samples
-                seconds["render"] += middle - start
-                seconds["metric"] += end - middle
-                drawn, drawing = drawn + part.samples, drawing + middle - start
-                watch.part(self.samples, drawn / drawing)
-                if checkpoint is not None and time.monotonic() - saved > CHECKPOINT_SECONDS:
-                    try:
-                        self.save(Path(checkpoint))
-                    except checkpoints.CheckpointError as error:  # a full disk: no reason to stop
-                        warnings.warn(str(error), stacklevel=3)
-                    saved = time.monotonic()
-                if (reason := ended()) is not None:
-                    return reason
-            speed = drawn / drawing
-            at_once = int(np.clip(PART_SECONDS * speed, SMALLEST_PART, LARGEST_PART))
+        def told(samples: int) -> None:
+            nonlocal saved
+            self.samples += samples
+            watch.part(self.samples, clock.speed)
+            if checkpoint is not None and time.monotonic() - saved > CHECKPOINT_SECONDS:
+                clock.spent("metric")
+                try:
+                    self.save(Path(checkpoint))
+                except checkpoints.CheckpointError as error:  # a full disk: no reason to stop
+                    warnings.warn(str(error), stacklevel=5)
+                saved = time.monotonic()
+                clock.spent(None)
+
+        report: Report | None = None
+        try:
+            for report in rounds(sampler, clock, clock.at_once, look=look, told=told):
+                watch.round(report)
+                if report.stop_reason is None and watch.presses():
+                    return "interrupted"
+        except _EndedError as ending:
+            return ending.reason
+        finally:
+            clock.spent("metric")
+        assert report is not None
+        assert report.stop_reason is not None
+        return report.stop_reason
 
     def result(self, reason: str, effects: str) -> Result:
         """Return the picture and what is known of it."""
@@ -421,6 +450,7 @@ class _Run:
             "seconds_render": self.seconds["render"],
             "seconds_metric": self.seconds["metric"],
             "seconds_total": self._total(),
+            "threads": self.threads,
             "variant": renderer.variant,
             "plan": {"effects_option": effects, "why": EFFECTS[effects], **renderer.plan()},
             "samples_min": int(sampler.count.min()),

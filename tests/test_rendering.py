@@ -277,6 +277,38 @@ def test_a_run_that_was_ended_goes_on_from_its_checkpoint(
         same(sampling.render(path, TOLERANCE, resume=tmp_path / "none", **options), whole)
 
 
+def test_a_large_image_keeps_to_its_number_of_threads(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, kept = torch.get_num_threads(), tmp_path / "run.npz"
+    assert sampling.render(path, max_spp=2, parameters=SMALL).figures["threads"] == 1
+    monkeypatch.setattr(rendering, "FEW_PIXELS", 0)
+    seen = []
+    decide = Model.simulated
+
+    def watched(model: Model, *options: Any, **named: Any) -> NDArray[np.float64]:
+        seen.append(torch.get_num_threads())
+        return decide(model, *options, **named)
+
+    monkeypatch.setattr(Model, "simulated", watched)
+
+    class Ended(Watch):
+        def presses(self) -> int:
+            return 1
+
+    try:
+        torch.set_num_threads(2)
+        options: dict[str, Any] = {"max_spp": 20, "parameters": SMALL}
+        begun = sampling.render(path, 0.1, checkpoint=kept, watch=Ended(), **options)
+        torch.set_num_threads(1)
+        went_on = sampling.render(path, 0.1, resume=kept, **options)
+    finally:
+        torch.set_num_threads(before)
+    assert (begun.stop_reason, went_on.stop_reason) == ("interrupted", "max_spp")
+    assert begun.figures["threads"] == went_on.figures["threads"] == 2
+    assert set(seen) == {2}
+
+
 def test_the_clock_ends_a_decision(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     decide, clock, now = Model.simulated, time.monotonic, {"decisions": 0, "late": 0.0}
 
