@@ -1,5 +1,6 @@
 """The renderer on Mitsuba: its numbers against themselves and against Mitsuba's own image."""
 
+import itertools
 import math
 import os
 import re
@@ -42,6 +43,30 @@ FOG = """
 </scene>
 """
 
+# Spectra that no three numbers stand for, one of a file of Mitsuba's, and a material of our own.
+SPECTRA = """
+<scene version="3.0.0">
+  <integrator type="path"><integer name="max_depth" value="4"/></integrator>
+  <sensor type="perspective"><float name="fov" value="35"/>
+    <transform name="to_world"><lookat origin="0,1,5" target="0,0.3,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="12"/><integer name="height" value="9"/>
+      <string name="component_format" value="float32"/><rfilter type="box"/></film>
+  </sensor>
+  <emitter type="constant"><spectrum name="radiance" type="blackbody">
+    <float name="temperature" value="3000"/></spectrum></emitter>
+  <shape type="sphere"><bsdf type="dielectric"><string name="int_ior" value="bk7"/></bsdf></shape>
+  <shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/>
+      <scale value="4"/><translate y="-1"/></transform><bsdf type="diffuse">
+    <spectrum name="reflectance" value="400:0.1, 500:0.9, 550:0.2, 700:0.8"/></bsdf></shape>
+  <shape type="cube"><transform name="to_world"><scale value="0.4"/>
+      <translate x="1.3" y="-0.5"/></transform>
+    <bsdf type="hemisphere"><rgb name="reflectance" value="0.8,0.3,0.1"/></bsdf></shape>
+  <shape type="cube"><transform name="to_world"><scale value="0.4"/>
+      <translate x="-1.3" y="-0.5"/></transform>
+    <bsdf type="roughconductor"><string name="material" value="Au"/></bsdf></shape>
+</scene>
+"""
+
 SENSOR = """
 <integrator type="path"/><sensor type="perspective">
   <transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform>
@@ -81,8 +106,13 @@ def moments(samples: Samples, count: int) -> tuple[NDArray[np.float64], NDArray[
     return radiance.mean(1), radiance.var(1, ddof=1) / count
 
 
-@pytest.mark.parametrize("rfilter", ["box", "gaussian", "lanczos"])
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"])
+@pytest.mark.parametrize(
+    ("variant", "rfilter"),
+    [
+        *itertools.product(("llvm_ad_rgb", "scalar_rgb"), ("box", "gaussian", "lanczos")),
+        ("llvm_ad_spectral", "box"),
+    ],
+)
 def test_sample_k_of_a_pixel_is_the_same_number_however_it_is_drawn(
     scene: tuple[Path, dict[str, str]], variant: str, rfilter: str
 ) -> None:
@@ -156,14 +186,35 @@ def test_seeds_pixels_and_samples_have_numbers_of_their_own(still_life: Path) ->
     assert abs((residual[0][:, 1:] * residual[0][:, :-1]).mean() + 1.0 / 64.0) < limit
 
 
-@pytest.mark.parametrize(("variant", "count"), [("llvm_ad_rgb", 2048), ("scalar_rgb", 128)])
+SPECTRAL = [("llvm_ad_spectral", 2048), ("scalar_spectral", 128)]
+
+
+@pytest.mark.parametrize(
+    ("variant", "count"), [("llvm_ad_rgb", 2048), ("scalar_rgb", 128), *SPECTRAL]
+)
 def test_the_mean_is_that_of_mitsubas_own_image(
     mitsuba: Any, scene: tuple[Path, dict[str, str]], variant: str, count: int
 ) -> None:
-    path, parameters = scene
+    assert_the_mean_is_mitsubas(mitsuba, *scene, variant, count)
+
+
+@pytest.mark.parametrize(("variant", "count"), SPECTRAL)
+def test_wavelengths_become_mitsubas_colours(
+    mitsuba: Any, tmp_path: Path, variant: str, count: int
+) -> None:
+    path = tmp_path / "spectra.xml"
+    path.write_text(SPECTRA)
+    assert_the_mean_is_mitsubas(mitsuba, path, {}, variant, count)
+
+
+def assert_the_mean_is_mitsubas(
+    mitsuba: Any, path: Path, parameters: dict[str, str], variant: str, count: int
+) -> None:
+    """Assert that ``count`` samples of a pixel have the mean of `mi.render`."""
     renderer = MitsubaRenderer(path, parameters, variant=variant)
+    assert renderer.variant == variant
     mean, variance = moments(draw(renderer, count), count)
-    mitsuba.set_variant("llvm_ad_rgb")
+    mitsuba.set_variant(variant.replace("scalar", "llvm_ad"))
     spp = 2048
     film = mitsuba.load_file(str(path), **parameters)
     image = np.array(mitsuba.render(film, spp=spp, seed=1))[..., :3].reshape(-1, 3)
@@ -374,8 +425,14 @@ def test_unknown_parameters_missing_files_and_variants_are_refused(still_life: P
         MitsubaRenderer(still_life.with_name("none.xml"))
     with pytest.raises(SceneError, match="a folder"):
         MitsubaRenderer(still_life.parent)
-    with pytest.raises(SceneError, match="expected a variant among"):
-        MitsubaRenderer(still_life, variant="llvm_ad_spectral")
+    for variant, instead in (
+        ("llvm_ad_spectral_polarized", "llvm_ad_spectral"),
+        ("llvm_ad_mono", "llvm_ad_rgb"),
+        ("llvm_ad_blue", "one of these"),
+    ):
+        wanted = f"expected a variant among .*, got {variant}; .* set {instead} before"
+        with pytest.raises(SceneError, match=wanted):
+            MitsubaRenderer(still_life, variant=variant)
     with pytest.raises(ValueError, match="expected a seed"):
         MitsubaRenderer(still_life, seed=-1)
 

@@ -363,8 +363,16 @@ def test_a_line_is_shown_on_a_terminal_alone(
 
 
 def test_what_cannot_be_rendered_is_refused_in_one_line(mitsuba: Any, path: Path) -> None:
-    mitsuba.set_variant("scalar_spectral")
-    spectral = mitsuba.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
+    mitsuba.set_variant("llvm_ad_spectral_polarized")
+    polarized = mitsuba.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
+    with pytest.raises(
+        SceneError, match=r"got llvm_ad_spectral_polarized; .* llvm_ad_spectral bef"
+    ):
+        sampling.render(mitsuba.cornell_box())
+    mitsuba.set_variant("llvm_ad_spectral")
+    bands = {"type": "specfilm", "band": {"type": "spectrum", "value": [(400, 0.0), (700, 1.0)]}}
+    with pytest.raises(SceneError, match="expected a film of colours, such as hdrfilm, got SpecF"):
+        sampling.render({"type": "scene", "sensor": {"type": "perspective", "film": bands}})
     mitsuba.set_variant("llvm_ad_rgb")
     loaded = mitsuba.load_dict(mitsuba.cornell_box())
     cases: list[tuple[Any, dict[str, Any], str]] = [
@@ -381,7 +389,7 @@ def test_what_cannot_be_rendered_is_refused_in_one_line(mitsuba: Any, path: Path
         ),
         (loaded, {"parameters": {"width": "3"}}, "parameters with a scene in a file alone"),
         (loaded, {"variant": "scalar_rgb"}, "the variant of the scene, llvm_ad_rgb, got scalar"),
-        (spectral, {}, "a scene of a variant among .*, got scalar_spectral"),
+        (polarized, {}, "a variant among .*, got llvm_ad_spectral_polarized; .*"),
         (loaded, {"checkpoint": "run.npz"}, "expected a scene in a file with a checkpoint"),
         (path, {"effects": "none"}, "expected effects among auto, full, got 'none'"),
         (path, {"time_limit": 0.0}, "expected a time limit over 0 s, got 0.0"),

@@ -26,8 +26,9 @@ from sampling.renderers.filter import FILTERS, SCENE, PixelFilter
 from sampling.renderers.llvm import OLDEST, PACKAGE, VARIABLE, find_llvm
 from sampling.renderers.protocol import Samples
 
-# In the order of preference; all compute in linear BT.709.
-VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
+# Chosen by themselves, in the order of preference; and those that follow wavelengths.
+RGB_VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
+VARIANTS = (*RGB_VARIANTS, "cuda_ad_spectral", "llvm_ad_spectral", "scalar_spectral")
 
 # Samples in one call of the compiled variants. Speed is flat from 3e5 on, and 27 bytes are needed
 # for each. Status: choice, measured.
@@ -142,6 +143,11 @@ class MitsubaRenderer:
         self._sensor = self._chosen_sensor(sensor)
         film = self._sensor.film()
         width, height = (int(side) for side in film.crop_size())
+        if film.flags() & int(self._mi.FilmFlags.Special):
+            raise SceneError(
+                f"{self.name}: expected a film of colours, such as hdrfilm, got "
+                f"{film.class_name()}, which keeps something else"
+            )
         if width * height == 0:
             raise SceneError(
                 f"{self.name}: expected a film of at least one pixel, got {width} x {height}"
@@ -261,14 +267,18 @@ class MitsubaRenderer:
         time = mi.Float(sensor.shutter_open())
         if sensor.shutter_open_time() > 0.0:
             time += sampler.next_1d() * sensor.shutter_open_time()
-        # No wavelength is sampled: the variants are RGB.
-        ray, weight = sensor.sample_ray_differential(time, 0.5, position, lens)
+        wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0.5)
+        ray, weight = sensor.sample_ray_differential(time, wavelength, position, lens)
         light, valid, aovs = self._integrator.sample(
             self._scene, sampler, ray, sensor.get_medium(), True
         )
+        light = weight * light
+        if mi.is_spectral:
+            # By the CIE curves at the wavelengths of the ray to XYZ, and from there, as films do.
+            light = mi.spectrum_to_srgb(light, ray.wavelengths)
         planes = [mi.Float(dr.select(valid, 1.0, 0.0))] if self._alpha else []
         planes += aovs[self._aov_at :]
-        return weight * light * place.weight, [plane * place.weight for plane in planes]
+        return light * place.weight, [plane * place.weight for plane in planes]
 
     def _load_file(self, path: Path, variant: str) -> None:
         """Load a scene from its file."""
@@ -294,7 +304,7 @@ class MitsubaRenderer:
             # What is in the dict may be of the variant that is set.
             mi = sys.modules.get("mitsuba")
             before = mi.variant() if mi is not None else None
-            variant = before if variant == "auto" and before in VARIANTS else variant
+            variant = before if variant == "auto" and before is not None else variant
         elif loaded is None or scene.class_name() != "Scene":
             kind = type(scene).__name__ if loaded is None else scene.class_name()
             raise SceneError(f"expected a scene: a path, a dict or an mi.Scene, got {kind}")
@@ -302,11 +312,6 @@ class MitsubaRenderer:
             if variant not in ("auto", loaded()):
                 raise SceneError(f"expected the variant of the scene, {loaded()}, got {variant}")
             variant = loaded()
-            if variant not in VARIANTS:
-                raise SceneError(
-                    f"expected a scene of a variant among {', '.join(VARIANTS)}, got {variant}; "
-                    "set one of them before it is loaded"
-                )
         self._mi = load_mitsuba(variant)
         if loaded is None:
             try:
@@ -457,8 +462,13 @@ def load_mitsuba(variant: str = "auto") -> Any:
         If mitsuba is not installed, or the variant that was asked for cannot run.
     """
     if variant not in ("auto", *VARIANTS):
-        raise SceneError(f"expected a variant among auto, {', '.join(VARIANTS)}, got {variant!r}")
-    llvm = find_llvm() is not None if variant in ("auto", "llvm_ad_rgb") else False
+        like = variant.removesuffix("_polarized").replace("_mono", "_rgb")
+        raise SceneError(
+            f"expected a variant among {', '.join(VARIANTS)}, got {variant}; those with "
+            "polarization, or with luminance alone, are not rendered, so set "
+            f"{like if like in VARIANTS else 'one of these'} before the scene is loaded"
+        )
+    llvm = find_llvm() is not None if variant == "auto" or "llvm" in variant else False
     try:
         mi = importlib.import_module("mitsuba")
         dr = importlib.import_module("drjit")
@@ -474,20 +484,21 @@ def load_mitsuba(variant: str = "auto") -> Any:
             f"expected LLVM {OLDEST} or newer, got {dr.detail.llvm_version()[0]}, which was loaded "
             f"when mitsuba was imported; call sampling.find_llvm() before that, or set {VARIABLE}"
         )
-    usable = {
-        "cuda_ad_rgb": bool(dr.has_backend(dr.JitBackend.CUDA)),
-        "llvm_ad_rgb": llvm,
-        "scalar_rgb": True,
-    }
+    usable = {"cuda": bool(dr.has_backend(dr.JitBackend.CUDA)), "llvm": llvm, "scalar": True}
     if variant == "auto":
-        variant = next(name for name in VARIANTS if usable[name])
+        variant = next(name for name in RGB_VARIANTS if usable[name.split("_")[0]])
         if variant == "scalar_rgb":
             warnings.warn(
                 "neither a GPU nor an LLVM of version 17 or newer was found: rendering with "
                 f"scalar_rgb, which is slow; install {PACKAGE}, or set {VARIABLE}",
                 stacklevel=2,
             )
-    if not usable[variant]:
+    if variant not in mi.variants():
+        raise SceneError(
+            f"expected a variant that Mitsuba was built with, {', '.join(mi.variants())}, "
+            f"got {variant}"
+        )
+    if not usable[variant.split("_")[0]]:
         need = f"an LLVM; install {PACKAGE}, or set {VARIABLE}" if "llvm" in variant else "a GPU"
         raise SceneError(f"{variant} needs {need}")
     # As on a machine, or in a container, of a single core.
