@@ -243,6 +243,7 @@ def test_albedo_normals_and_depth_come_along(still_life: Path) -> None:
 
 @pytest.mark.parametrize("rfilter", ["box", "mitchell"])
 def test_a_sensor_of_one_ray(mitsuba: Any, rfilter: str) -> None:
+    mitsuba.set_variant("llvm_ad_rgb")
     scene = mitsuba.load_dict(
         {
             "type": "scene",
