@@ -18,10 +18,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from benchmarks.record import caption, circumstances, save
 from benchmarks.scenes import STILL_LIFE, scene_file, sized
-from sampling import Request, Sampler, Settings
+from sampling import Request, Sampler, Samples, Settings, rounds
 from sampling.renderers.mitsuba import MitsubaRenderer, load_mitsuba
 from sampling.statistics import Statistics
 from torch_vdm import VDM, Display
@@ -72,23 +73,10 @@ def measured(
     renderer.sample(few, 0 * few, 0 * few + 1)  # compiles
     sampler = Sampler(renderer.size, VDM(PPD, Display.linear(WHITE)), Settings(tolerance=tolerance))
     seconds = dict.fromkeys(("rendering", "statistics", "decisions"), 0.0)
-    before = time.process_time()
-
-    def spent(what: str) -> None:
-        nonlocal before
-        now = time.process_time()
-        seconds[what] += now - before
-        before = now
-
-    # The loop of `sampling.rounds`, with a clock.
-    while (request := sampler.ask()) is not None:
-        spent("decisions")
-        for part in request.parts(AT_ONCE):
-            samples = renderer.sample(part.pixels, part.first, part.count)
-            spent("rendering")
-            sampler.tell(samples)
-            spent("statistics")
-    spent("decisions")
+    clock = _Clock(renderer, seconds)
+    for _ in rounds(sampler, clock, told=lambda _: clock.spent("statistics")):
+        pass
+    clock.spent("decisions")
     report = sampler.report()
     assert report is not None
     return {
@@ -102,6 +90,28 @@ def measured(
         **{f"{what}_seconds": value for what, value in seconds.items()},
         "share": 1.0 - seconds["rendering"] / sum(seconds.values()),
     }
+
+
+class _Clock:
+    """A renderer that says what the time has gone to."""
+
+    def __init__(self, renderer: MitsubaRenderer, seconds: dict[str, float]) -> None:
+        self.size = renderer.size
+        self._renderer, self._seconds = renderer, seconds
+        self._before = time.process_time()
+
+    def spent(self, what: str) -> None:
+        now = time.process_time()
+        self._seconds[what] += now - self._before
+        self._before = now
+
+    def sample(
+        self, pixels: NDArray[np.int64], first: NDArray[np.int64], count: NDArray[np.int64]
+    ) -> Samples:
+        self.spent("decisions")
+        samples = self._renderer.sample(pixels, first, count)
+        self.spent("rendering")
+        return samples
 
 
 def throughput(

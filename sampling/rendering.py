@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from sampling import checkpoint as checkpoints
 from sampling import plan as plans
 from sampling.plan import AUTO, FULL, Pilot, Plan
+from sampling.renderers import Samples
 from sampling.renderers.filter import SCENE
 from sampling.renderers.mitsuba import MitsubaRenderer, preserved
-from sampling.sampler import Report, Sampler, Settings, StrategyName, under
+from sampling.sampler import Report, Sampler, Settings, StrategyName, rounds, under
 from torch_vdm import VDM, Display, Observer, __version__
 from torch_vdm.io import atomic_path, write_channels
 from torch_vdm.model.distance import VISIBLE
@@ -162,7 +163,9 @@ def render(
 ) -> Result:
     """Render a scene of Mitsuba until nobody can see what is still missing.
 
-    The same arguments give the same image, bit for bit; ``time_limit`` alone is outside this.
+    The same arguments give the same image, bit for bit; ``time_limit`` alone is outside this, and
+    for images of 2^18 pixels and more the number of threads of torch is one of the arguments: the
+    figures tell it, and a run that goes on from a checkpoint takes the number it began with.
     Mitsuba's variant and log level are afterwards what they were, as are the numbers of threads.
 
     Parameters
@@ -263,16 +266,16 @@ def render(
         }
         plan, piloted = plans.read(renderer.needs, effects, settings, renderer.size)
         sampler = Sampler(renderer.size, metric, settings)
-        run = _Run(renderer, sampler, identity, begun, effects, plan, piloted)
+        threads = 1 if height * width < FEW_PIXELS else torch.get_num_threads()
+        run = _Run(renderer, sampler, identity, begun, threads, effects, plan, piloted)
         if checkpoint is not None or resume is not None:
             run.check_kept()
         if resume is not None:
             run.go_on(Path(resume))
         if run.plan.integrator is not None:
             renderer.simulate(run.plan.max_depth)
-        few = height * width < FEW_PIXELS
         with (
-            _threads(1 if few else torch.get_num_threads()),
+            _threads(run.threads),
             _told(watch or Watch(), tolerance) as told,
         ):
             told.begin()
@@ -290,6 +293,47 @@ class _EndedError(Exception):
         self.reason = reason
 
 
+class _Clock:
+    """A renderer whose time is measured, and all other time beside it."""
+
+    def __init__(self, renderer: MitsubaRenderer, seconds: dict[str, float]) -> None:
+        self.size = renderer.size
+        self.speed = 0.0
+        """Samples a second."""
+        self._renderer, self._seconds = renderer, seconds
+        self._before = time.perf_counter()
+        self._drawn, self._drawing = 0, 0.0
+
+    def spent(self, what: str | None) -> float:
+        """Say what the time since the last call went to; None: nothing that is told."""
+        now = time.perf_counter()
+        passed, self._before = now - self._before, now
+        if what is not None:
+            self._seconds[what] += passed
+        return passed
+
+    def sample(
+        self, pixels: NDArray[np.int64], first: NDArray[np.int64], count: NDArray[np.int64]
+    ) -> Samples:
+        """Draw what the renderer draws."""
+        self.spent("metric")
+        samples = self._renderer.sample(pixels, first, count)
+        self.drew(len(samples.pixels))
+        return samples
+
+    def drew(self, samples: int) -> None:
+        """Say that the time since the last call went to so many samples."""
+        self._drawing += self.spent("render")
+        self._drawn += samples
+        self.speed = self._drawn / self._drawing
+
+    def at_once(self) -> int:
+        """Return how many samples to draw between two looks at the clock."""
+        if not self._drawn:
+            return FIRST_PART
+        return int(np.clip(PART_SECONDS * self.speed, SMALLEST_PART, LARGEST_PART))
+
+
 @dataclass
 class _Run:
     """A scene, its sampler, and what the run has cost, over all its interruptions."""
@@ -299,6 +343,8 @@ class _Run:
     identity: dict[str, Any]
     begun: float
     """When this part of the run began, by the monotonic clock."""
+    threads: int
+    """That the metric computes on, on which the last bits depend; a run keeps to them."""
     effects: str
     plan: Plan
     piloted: bool
@@ -327,6 +373,7 @@ class _Run:
         state["plan"] = json.dumps(
             {"effects": self.effects, "piloted": self.piloted, "plan": self.plan.state()}
         )
+        state["progress.threads"] = self.threads
         for name, seconds in (self.seconds | {"total": self._total()}).items():
             state[f"progress.seconds_{name}"] = seconds
         checkpoints.save(path, checkpoints.Checkpoint(self.identity, state))
@@ -343,7 +390,7 @@ class _Run:
                 return  # it ended within the pilot, of which nothing is kept
             self._take_over(path, begun)
             self.sampler = Sampler.restore(under("sampler.", state), self.sampler.metric)
-            self.samples = state["progress.samples"]
+            self.samples, self.threads = state["progress.samples"], state["progress.threads"]
             self.seconds = {name: state[f"progress.seconds_{name}"] for name in self.seconds}
             if self.renderer.aov_sums is not None:
                 self.renderer.aov_sums[:] = state["aov_sums"]
@@ -374,94 +421,68 @@ class _Run:
             return report
         return report._replace(predicted=report.predicted + bound, jnd=report.jnd + bound)
 
-    def _draw_pilot(
-        self, pilot: Pilot, watch: Watch, ended: Callable[[], str | None]
-    ) -> str | None:
-        """Draw the first round; return why the run ended within it, if it did."""
-        drawn, drawing, start = 0, 0.0, time.perf_counter()
+    def _draw_pilot(self, watch: Watch, clock: _Clock, look: Callable[[], None]) -> Pilot:
+        """Draw the first round, in which more is told of each sample than its light."""
+        pilot = Pilot(self.plan, self.renderer, self.sampler)
+        clock.spent("metric")
         for part in pilot.steps():
-            end = time.perf_counter()
+            clock.drew(part)
             self.samples += part
-            self.seconds["render"] += end - start
-            drawn, drawing = drawn + part, drawing + end - start
-            watch.part(self.samples, drawn / drawing)
-            if (reason := ended()) is not None:
-                return reason
-            start = time.perf_counter()
-        return None
+            watch.part(self.samples, clock.speed)
+            look()
+        return pilot
 
     def _settle(self, pilot: Pilot) -> None:
         """Take over what the pilot says of the plan."""
-        start = time.perf_counter()
         pilot.settle()
         self.sampler, self.plan, self.piloted = pilot.sampler, pilot.plan, False
-        self.seconds["metric"] += time.perf_counter() - start
 
     def until_done(
         self, watch: Watch, time_limit: float, checkpoint: str | os.PathLike[str] | None
     ) -> str:
         """Render until the sampler, the clock or the user says stop; return the reason."""
-        seconds = self.seconds
         saved = time.monotonic()
-        at_once = FIRST_PART
-        drawn, drawing = 0, 0.0
-
-        def ended() -> str | None:
-            """Return why no more is to be done at all."""
-            if watch.presses() > 1:
-                return "interrupted"
-            # The first round is always completed: without it there is no image, and no prediction.
-            late = time.monotonic() - self.begun > time_limit
-            return "time_limit" if late and self.sampler.report() is not None else None
+        clock = _Clock(self.renderer, self.seconds)
 
         def look() -> None:
-            if (reason := ended()) is not None:
-                raise _EndedError(reason)
+            """End the run where no more is to be done at all."""
+            if watch.presses() > 1:
+                raise _EndedError("interrupted")
+            # The first round is always completed: without it there is no image, and no prediction.
+            late = time.monotonic() - self.begun > time_limit
+            if late and self.sampler.report() is not None:
+                raise _EndedError("time_limit")
 
-        pilot = Pilot(self.plan, self.renderer, self.sampler) if self.piloted else None
-        if pilot is not None and (reason := self._draw_pilot(pilot, watch, ended)) is not None:
-            return reason
-        while True:
-            sampler = self.sampler
-            start = time.perf_counter()
-            try:
-                request = sampler.ask(look)
-            except _EndedError as ending:
-                return ending.reason
-            finally:
-                seconds["metric"] += time.perf_counter() - start
-            report = self.report()
-            watch.round(report)
-            if request is None:
-                assert report is not None
-                assert report.stop_reason is not None
-                return report.stop_reason
-            if report is not None and watch.presses():
-                return "interrupted"
-            if pilot is not None and self.piloted:
-                self._settle(pilot)
-                continue
-            for part in request.parts(at_once):
-                start = time.perf_counter()
-                samples = self.renderer.sample(part.pixels, part.first, part.count)
-                middle = time.perf_counter()
-                sampler.tell(samples)
-                end = time.perf_counter()
-                self.samples += part.samples
-                seconds["render"] += middle - start
-                seconds["metric"] += end - middle
-                drawn, drawing = drawn + part.samples, drawing + middle - start
-                watch.part(self.samples, drawn / drawing)
-                if checkpoint is not None and time.monotonic() - saved > CHECKPOINT_SECONDS:
-                    try:
-                        self.save(Path(checkpoint))
-                    except checkpoints.CheckpointError as error:  # a full disk: no reason to stop
-                        warnings.warn(str(error), stacklevel=3)
-                    saved = time.monotonic()
-                if (reason := ended()) is not None:
-                    return reason
-            speed = drawn / drawing
-            at_once = int(np.clip(PART_SECONDS * speed, SMALLEST_PART, LARGEST_PART))
+        def told(samples: int) -> None:
+            nonlocal saved
+            self.samples += samples
+            watch.part(self.samples, clock.speed)
+            if checkpoint is not None and time.monotonic() - saved > CHECKPOINT_SECONDS:
+                clock.spent("metric")
+                try:
+                    self.save(Path(checkpoint))
+                except checkpoints.CheckpointError as error:  # a full disk: no reason to stop
+                    warnings.warn(str(error), stacklevel=5)
+                saved = time.monotonic()
+                clock.spent(None)
+
+        try:
+            pilot = self._draw_pilot(watch, clock, look) if self.piloted else None
+            while True:
+                for report in rounds(self.sampler, clock, clock.at_once, look=look, told=told):
+                    watch.round(self.report())
+                    if report.stop_reason is not None:
+                        return report.stop_reason
+                    if watch.presses():
+                        return "interrupted"
+                    if pilot is not None and self.piloted:
+                        # From here on with another sampler, where something is left out.
+                        self._settle(pilot)
+                        break
+        except _EndedError as ending:
+            return ending.reason
+        finally:
+            clock.spent("metric")
 
     def result(self, reason: str) -> Result:
         """Return the picture and what is known of it."""
@@ -487,6 +508,7 @@ class _Run:
             "seconds_render": self.seconds["render"],
             "seconds_metric": self.seconds["metric"],
             "seconds_total": self._total(),
+            "threads": self.threads,
             "variant": renderer.variant,
             "plan": {"effects_option": self.effects, **plan.figures(), **renderer.plan()},
             "samples_min": int(sampler.count.min()),

@@ -416,23 +416,42 @@ class Sampler:
         return wanted
 
 
-def rounds(sampler: Sampler, renderer: Renderer, at_once: int = 2**20) -> Iterator[Report]:
+def rounds(
+    sampler: Sampler,
+    renderer: Renderer,
+    at_once: int | Callable[[], int] = 2**20,
+    *,
+    look: Callable[[], None] = lambda: None,
+    told: Callable[[int], None] = lambda _: None,
+) -> Iterator[Report]:
     """Render until the sampler stops; yield its report after each round.
 
-    ``at_once``: samples asked of the renderer in one call. It changes memory and speed, no bit of
-    the result.
+    Parameters
+    ----------
+    sampler, renderer
+        Who decides, and who draws.
+    at_once
+        Samples asked of the renderer in one call, or what gives them for each round. It changes
+        memory and speed, no bit of the result.
+    look
+        Called after each call of the renderer, and now and then within a decision. What it raises
+        ends the rounds where they are, and begun anew they go on from there.
+    told
+        Called with the number of samples that have just been folded in, before ``look``.
     """
     seen: Report | None = None
     while True:
-        request = sampler.ask()
+        request = sampler.ask(look)
         report = sampler.report()
         if report is not None and report is not seen:
             yield report
             seen = report
         if request is None:
             return
-        for part in request.parts(at_once):
+        for part in request.parts(at_once if isinstance(at_once, int) else at_once()):
             sampler.tell(renderer.sample(part.pixels, part.first, part.count))
+            told(part.samples)
+            look()
 
 
 def under(prefix: str, state: dict[str, Any]) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """The renderer on Mitsuba: its numbers against themselves and against Mitsuba's own image."""
 
+import itertools
 import math
 import os
 import re
@@ -42,6 +43,30 @@ FOG = """
 </scene>
 """
 
+# Spectra that no three numbers stand for, one of a file of Mitsuba's, and a material of our own.
+SPECTRA = """
+<scene version="3.0.0">
+  <integrator type="path"><integer name="max_depth" value="4"/></integrator>
+  <sensor type="perspective"><float name="fov" value="35"/>
+    <transform name="to_world"><lookat origin="0,1,5" target="0,0.3,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="12"/><integer name="height" value="9"/>
+      <string name="component_format" value="float32"/><rfilter type="box"/></film>
+  </sensor>
+  <emitter type="constant"><spectrum name="radiance" type="blackbody">
+    <float name="temperature" value="3000"/></spectrum></emitter>
+  <shape type="sphere"><bsdf type="dielectric"><string name="int_ior" value="bk7"/></bsdf></shape>
+  <shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/>
+      <scale value="4"/><translate y="-1"/></transform><bsdf type="diffuse">
+    <spectrum name="reflectance" value="400:0.1, 500:0.9, 550:0.2, 700:0.8"/></bsdf></shape>
+  <shape type="cube"><transform name="to_world"><scale value="0.4"/>
+      <translate x="1.3" y="-0.5"/></transform>
+    <bsdf type="hemisphere"><rgb name="reflectance" value="0.8,0.3,0.1"/></bsdf></shape>
+  <shape type="cube"><transform name="to_world"><scale value="0.4"/>
+      <translate x="-1.3" y="-0.5"/></transform>
+    <bsdf type="roughconductor"><string name="material" value="Au"/></bsdf></shape>
+</scene>
+"""
+
 SENSOR = """
 <integrator type="path"/><sensor type="perspective">
   <transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform>
@@ -81,8 +106,13 @@ def moments(samples: Samples, count: int) -> tuple[NDArray[np.float64], NDArray[
     return radiance.mean(1), radiance.var(1, ddof=1) / count
 
 
-@pytest.mark.parametrize("rfilter", ["box", "gaussian", "lanczos"])
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"])
+@pytest.mark.parametrize(
+    ("variant", "rfilter"),
+    [
+        *itertools.product(("llvm_ad_rgb", "scalar_rgb"), ("box", "gaussian", "lanczos")),
+        ("llvm_ad_spectral", "box"),
+    ],
+)
 def test_sample_k_of_a_pixel_is_the_same_number_however_it_is_drawn(
     scene: tuple[Path, dict[str, str]], variant: str, rfilter: str
 ) -> None:
@@ -156,14 +186,35 @@ def test_seeds_pixels_and_samples_have_numbers_of_their_own(still_life: Path) ->
     assert abs((residual[0][:, 1:] * residual[0][:, :-1]).mean() + 1.0 / 64.0) < limit
 
 
-@pytest.mark.parametrize(("variant", "count"), [("llvm_ad_rgb", 2048), ("scalar_rgb", 128)])
+SPECTRAL = [("llvm_ad_spectral", 2048), ("scalar_spectral", 128)]
+
+
+@pytest.mark.parametrize(
+    ("variant", "count"), [("llvm_ad_rgb", 2048), ("scalar_rgb", 128), *SPECTRAL]
+)
 def test_the_mean_is_that_of_mitsubas_own_image(
     mitsuba: Any, scene: tuple[Path, dict[str, str]], variant: str, count: int
 ) -> None:
-    path, parameters = scene
+    assert_the_mean_is_mitsubas(mitsuba, *scene, variant, count)
+
+
+@pytest.mark.parametrize(("variant", "count"), SPECTRAL)
+def test_wavelengths_become_mitsubas_colours(
+    mitsuba: Any, tmp_path: Path, variant: str, count: int
+) -> None:
+    path = tmp_path / "spectra.xml"
+    path.write_text(SPECTRA)
+    assert_the_mean_is_mitsubas(mitsuba, path, {}, variant, count)
+
+
+def assert_the_mean_is_mitsubas(
+    mitsuba: Any, path: Path, parameters: dict[str, str], variant: str, count: int
+) -> None:
+    """Assert that ``count`` samples of a pixel have the mean of `mi.render`."""
     renderer = MitsubaRenderer(path, parameters, variant=variant)
+    assert renderer.variant == variant
     mean, variance = moments(draw(renderer, count), count)
-    mitsuba.set_variant("llvm_ad_rgb")
+    mitsuba.set_variant(variant.replace("scalar", "llvm_ad"))
     spp = 2048
     film = mitsuba.load_file(str(path), **parameters)
     image = np.array(mitsuba.render(film, spp=spp, seed=1))[..., :3].reshape(-1, 3)
@@ -188,6 +239,32 @@ def test_albedo_normals_and_depth_come_along(still_life: Path) -> None:
     assert normal == pytest.approx((0.0, 0.0, 1.0), abs=1e-6)
     # The wall is 8.8 from the eye, at z = -2.2; rays to the corner are longer.
     assert 8.8 < aovs["depth.Z"][0, 0] < 1.2 * 8.8
+
+
+@pytest.mark.parametrize("rfilter", ["box", "mitchell"])
+def test_a_sensor_of_one_ray(mitsuba: Any, rfilter: str) -> None:
+    mitsuba.set_variant("llvm_ad_rgb")
+    scene = mitsuba.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path"},
+            "sensor": {
+                "type": "radiancemeter",
+                "to_world": mitsuba.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": rfilter}},
+            },
+            "light": {
+                "type": "sphere",
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [1.0, 2.0, 3.0]}},
+            },
+        }
+    )
+    renderer = MitsubaRenderer(scene, aov=True)
+    samples = draw(renderer, 6)
+    np.testing.assert_allclose(samples.radiance, np.tile([[1.0, 2.0, 3.0]], (6, 1)), rtol=1e-6)
+    aovs = renderer.aovs()
+    assert aovs["depth.Z"].item() == pytest.approx(2.0, rel=1e-3)
+    assert aovs["normal.Z"].item() == pytest.approx(1.0, rel=1e-3)
 
 
 def test_radiance_that_is_not_finite_is_handed_on(mitsuba: Any, tmp_path: Path) -> None:
@@ -234,6 +311,42 @@ def test_the_fingerprint_is_of_everything_that_is_named(mitsuba: Any, tmp_path: 
     assert len(set(seen)) == 5
 
 
+def triangle(size: int) -> str:
+    """Return a mesh, as an OBJ file."""
+    return f"v 0 0 0\nv {size} 0 0\nv 0 {size} 0\nf 1 2 3\n"
+
+
+def test_the_fingerprint_is_of_the_files_that_are_loaded(
+    mitsuba: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, linked, working, named = (tmp_path / name for name in ("own", "linked", "cwd", "named"))
+    for folder in (own, linked, working, named):
+        folder.mkdir()
+    monkeypatch.chdir(working)
+    scene, spectrum = own / "scene.xml", own / "grey.spd"
+    scene.write_text(
+        f'<scene version="3.0.0">{SENSOR}<path value="{named}"/><emitter type="constant"/>'
+        '<shape type="obj"><string name="filename" value="one.obj"/><bsdf type="diffuse">'
+        '<spectrum name="reflectance" filename="grey.spd"/></bsdf></shape></scene>'
+    )
+    spectrum.write_text("400 0.5\n700 0.25\n")
+    (linked / "scene.xml").symlink_to(scene)
+    paths = list(mitsuba.file_resolver())
+
+    # From where it is looked for last to where it is looked for first.
+    for folder in (working, own, linked, named):
+        (folder / "one.obj").write_text(triangle(1))
+        before = MitsubaRenderer(linked / "scene.xml")
+        assert before._scene.bbox().max.x == 1.0
+        (folder / "one.obj").write_text(triangle(2))
+        after = MitsubaRenderer(linked / "scene.xml")
+        assert after._scene.bbox().max.x == 2.0
+        assert after.fingerprint != before.fingerprint
+    spectrum.write_text("400 0.5\n700 0.75\n")
+    assert MitsubaRenderer(linked / "scene.xml").fingerprint != after.fingerprint
+    assert list(mitsuba.file_resolver()) == paths
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -275,7 +388,8 @@ def test_the_fingerprint_is_of_everything_that_is_named(mitsuba: Any, tmp_path: 
         ),
         (
             '<scene version="3.0.0">' + SENSOR.replace('"path"', '"prb"') + "</scene>",
-            "expected an integrator that samples single rays",
+            "expected an integrator that samples single rays, such as path, volpath or direct, "
+            "got prb",
         ),
         (
             f'<scene version="3.0.0">{SENSOR}<shape type="sphere"/></scene>',
@@ -312,8 +426,14 @@ def test_unknown_parameters_missing_files_and_variants_are_refused(still_life: P
         MitsubaRenderer(still_life.with_name("none.xml"))
     with pytest.raises(SceneError, match="a folder"):
         MitsubaRenderer(still_life.parent)
-    with pytest.raises(SceneError, match="expected a variant among"):
-        MitsubaRenderer(still_life, variant="llvm_ad_spectral")
+    for variant, instead in (
+        ("llvm_ad_spectral_polarized", "llvm_ad_spectral"),
+        ("llvm_ad_mono", "llvm_ad_rgb"),
+        ("llvm_ad_blue", "one of these"),
+    ):
+        wanted = f"expected a variant among .*, got {variant}; .* set {instead} before"
+        with pytest.raises(SceneError, match=wanted):
+            MitsubaRenderer(still_life, variant=variant)
     with pytest.raises(ValueError, match="expected a seed"):
         MitsubaRenderer(still_life, seed=-1)
 

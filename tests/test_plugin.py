@@ -14,7 +14,7 @@ from sampling.renderers.mitsuba import SceneError, load_mitsuba
 TOLERANCE = 2.0
 
 
-@pytest.fixture(params=["llvm_ad_rgb", "scalar_rgb"])
+@pytest.fixture(params=["llvm_ad_spectral", "scalar_rgb", "llvm_ad_rgb"])
 def mitsuba(request: pytest.FixtureRequest) -> Any:
     """Return Mitsuba with the integrator, of a variant."""
     try:

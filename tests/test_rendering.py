@@ -277,6 +277,38 @@ def test_a_run_that_was_ended_goes_on_from_its_checkpoint(
         same(sampling.render(path, TOLERANCE, resume=tmp_path / "none", **options), whole)
 
 
+def test_a_large_image_keeps_to_its_number_of_threads(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, kept = torch.get_num_threads(), tmp_path / "run.npz"
+    assert sampling.render(path, max_spp=2, parameters=SMALL).figures["threads"] == 1
+    monkeypatch.setattr(rendering, "FEW_PIXELS", 0)
+    seen = []
+    decide = Model.simulated
+
+    def watched(model: Model, *options: Any, **named: Any) -> NDArray[np.float64]:
+        seen.append(torch.get_num_threads())
+        return decide(model, *options, **named)
+
+    monkeypatch.setattr(Model, "simulated", watched)
+
+    class Ended(Watch):
+        def presses(self) -> int:
+            return 1
+
+    try:
+        torch.set_num_threads(2)
+        options: dict[str, Any] = {"max_spp": 20, "parameters": SMALL}
+        begun = sampling.render(path, 0.1, checkpoint=kept, watch=Ended(), **options)
+        torch.set_num_threads(1)
+        went_on = sampling.render(path, 0.1, resume=kept, **options)
+    finally:
+        torch.set_num_threads(before)
+    assert (begun.stop_reason, went_on.stop_reason) == ("interrupted", "max_spp")
+    assert begun.figures["threads"] == went_on.figures["threads"] == 2
+    assert set(seen) == {2}
+
+
 def test_the_clock_ends_a_decision(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     decide, clock, now = Model.simulated, time.monotonic, {"decisions": 0, "late": 0.0}
 
@@ -331,8 +363,16 @@ def test_a_line_is_shown_on_a_terminal_alone(
 
 
 def test_what_cannot_be_rendered_is_refused_in_one_line(mitsuba: Any, path: Path) -> None:
-    mitsuba.set_variant("scalar_spectral")
-    spectral = mitsuba.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
+    mitsuba.set_variant("llvm_ad_spectral_polarized")
+    polarized = mitsuba.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
+    with pytest.raises(
+        SceneError, match=r"got llvm_ad_spectral_polarized; .* llvm_ad_spectral bef"
+    ):
+        sampling.render(mitsuba.cornell_box())
+    mitsuba.set_variant("llvm_ad_spectral")
+    bands = {"type": "specfilm", "band": {"type": "spectrum", "value": [(400, 0.0), (700, 1.0)]}}
+    with pytest.raises(SceneError, match="expected a film of colours, such as hdrfilm, got SpecF"):
+        sampling.render({"type": "scene", "sensor": {"type": "perspective", "film": bands}})
     mitsuba.set_variant("llvm_ad_rgb")
     loaded = mitsuba.load_dict(mitsuba.cornell_box())
     cases: list[tuple[Any, dict[str, Any], str]] = [
@@ -349,7 +389,7 @@ def test_what_cannot_be_rendered_is_refused_in_one_line(mitsuba: Any, path: Path
         ),
         (loaded, {"parameters": {"width": "3"}}, "parameters with a scene in a file alone"),
         (loaded, {"variant": "scalar_rgb"}, "the variant of the scene, llvm_ad_rgb, got scalar"),
-        (spectral, {}, "a scene of a variant among .*, got scalar_spectral"),
+        (polarized, {}, "a variant among .*, got llvm_ad_spectral_polarized; .*"),
         (loaded, {"checkpoint": "run.npz"}, "expected a scene in a file with a checkpoint"),
         (path, {"effects": "none"}, "expected effects among auto, full, got 'none'"),
         (path, {"time_limit": 0.0}, "expected a time limit over 0 s, got 0.0"),

@@ -113,6 +113,33 @@ def test_a_decision_that_is_given_up_leaves_nothing(unbiased: bool) -> None:
     assert_same_state(sampler.state(), whole.state())
 
 
+def test_rounds_are_told_ended_and_gone_on_with() -> None:
+    settings = Settings(tolerance=2.0)
+    whole, renderer = Sampler(SIZE, METRIC, settings), spotted()
+    finished(whole, renderer)
+    sampler = Sampler(SIZE, METRIC, settings)
+    drawn, ends, sizes = 0, 0, iter((64, 100, 2**20))
+
+    def told(samples: int) -> None:
+        nonlocal drawn
+        drawn += samples
+
+    def look() -> None:
+        if drawn > 200 * (ends + 1):
+            raise TimeoutError
+
+    reports: list[Report] = []
+    while not reports or reports[-1].stop_reason is None:
+        try:
+            for report in rounds(sampler, renderer, lambda: next(sizes, 512), look=look, told=told):
+                reports.append(report)  # noqa: PERF402  # what came before an end is kept
+        except TimeoutError:
+            ends += 1
+    assert ends > 5
+    assert drawn == whole.count.sum() == reports[-1].samples
+    assert_same_state(sampler.state(), whole.state())
+
+
 def test_the_state_is_plain() -> None:
     sampler = Sampler(SIZE, METRIC, Settings(tolerance=2.0))
     finished(sampler, spotted())

@@ -14,7 +14,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,8 +28,9 @@ from sampling.renderers.needs import PATH, Needs
 from sampling.renderers.needs import read as read_needs
 from sampling.renderers.protocol import Samples
 
-# In the order of preference; all compute in linear BT.709.
-VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
+# Chosen by themselves, in the order of preference; and those that follow wavelengths.
+RGB_VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
+VARIANTS = (*RGB_VARIANTS, "cuda_ad_spectral", "llvm_ad_spectral", "scalar_spectral")
 
 # Samples in one call of the compiled variants. Speed is flat from 3e5 on, and 27 bytes are needed
 # for each. Status: choice, measured.
@@ -154,6 +155,11 @@ class MitsubaRenderer:
         self._sensor = self._chosen_sensor(sensor)
         film = self._sensor.film()
         width, height = (int(side) for side in film.crop_size())
+        if film.flags() & int(self._mi.FilmFlags.Special):
+            raise SceneError(
+                f"{self.name}: expected a film of colours, such as hdrfilm, got "
+                f"{film.class_name()}, which keeps something else"
+            )
         if width * height == 0:
             raise SceneError(
                 f"{self.name}: expected a film of at least one pixel, got {width} x {height}"
@@ -285,8 +291,15 @@ class MitsubaRenderer:
         # Of two rays the second is taken off.
         radiance, aovs = self._follow(sampler, pixel % width, pixel // width, (ray & 1) == 1)
         dr.eval(radiance, aovs)
-        planes = [np.asarray(plane.numpy()).reshape(-1, rays).sum(1)[:drawn] for plane in aovs]
-        return np.asarray(radiance.numpy()).T.reshape(-1, rays, 3).sum(1)[:drawn], planes
+        # What is the same for all is one number.
+        light, *planes = (
+            np.broadcast_to(plane.numpy(), (*plane.numpy().shape[:-1], rays * len(pixels)))
+            for plane in (radiance, *aovs)
+        )
+        return (
+            light.T.reshape(-1, rays, 3).sum(1)[:drawn],
+            [plane.reshape(-1, rays).sum(1)[:drawn] for plane in planes],
+        )
 
     def _draw_one_by_one(
         self, pixels: NDArray[np.int64], numbers: NDArray[np.int64]
@@ -320,11 +333,15 @@ class MitsubaRenderer:
         time = mi.Float(sensor.shutter_open())
         if sensor.shutter_open_time() > 0.0:
             time += sampler.next_1d() * sensor.shutter_open_time()
-        # No wavelength is sampled: the variants are RGB.
-        ray, weight = sensor.sample_ray_differential(time, 0.5, position, lens)
+        wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0.5)
+        ray, weight = sensor.sample_ray_differential(time, wavelength, position, lens)
         light, valid, aovs = self._integrator.sample(
             self._scene, sampler, ray, sensor.get_medium(), True
         )
+        light = weight * light
+        if mi.is_spectral:
+            # By the CIE curves at the wavelengths of the ray to XYZ, and from there, as films do.
+            light = mi.spectrum_to_srgb(light, ray.wavelengths)
         planes = [mi.Float(dr.select(valid, 1.0, 0.0))] if self._alpha else []
         planes += aovs[self._aov_at :]
         planes = [plane * place.weight for plane in planes]
@@ -332,7 +349,7 @@ class MitsubaRenderer:
             # Light, but for the last, which is a number.
             light_too = i < len(aovs[self._told]) - 1
             planes.append(weight[i % 3] * plane * place.weight if light_too else plane)
-        return weight * light * place.weight, planes
+        return light * place.weight, planes
 
     def _load_file(self, path: Path, variant: str) -> None:
         """Load a scene from its file."""
@@ -341,8 +358,9 @@ class MitsubaRenderer:
             what = "a folder or a device" if path.exists() else "no such file"
             raise SceneError(f"{path}: expected a scene of Mitsuba (XML), got {what}")
         self._mi = load_mitsuba(variant)
-        state = self._parse(path)
-        self._scene = self._instantiate(path, state)
+        with _files_of(self._mi, path) as found:
+            state = self._parse(path, found)
+            self._scene = self._instantiate(path, state)
         self._named = _integrator_names(self._mi, state)
 
     def _take(self, scene: Any, variant: str) -> None:
@@ -357,7 +375,7 @@ class MitsubaRenderer:
             # What is in the dict may be of the variant that is set.
             mi = sys.modules.get("mitsuba")
             before = mi.variant() if mi is not None else None
-            variant = before if variant == "auto" and before in VARIANTS else variant
+            variant = before if variant == "auto" and before is not None else variant
         elif loaded is None or scene.class_name() != "Scene":
             kind = type(scene).__name__ if loaded is None else scene.class_name()
             raise SceneError(f"expected a scene: a path, a dict or an mi.Scene, got {kind}")
@@ -365,11 +383,6 @@ class MitsubaRenderer:
             if variant not in ("auto", loaded()):
                 raise SceneError(f"expected the variant of the scene, {loaded()}, got {variant}")
             variant = loaded()
-            if variant not in VARIANTS:
-                raise SceneError(
-                    f"expected a scene of a variant among {', '.join(VARIANTS)}, got {variant}; "
-                    "set one of them before it is loaded"
-                )
         self._mi = load_mitsuba(variant)
         if loaded is None:
             try:
@@ -407,8 +420,11 @@ class MitsubaRenderer:
         self.sensor = int(wanted), named[wanted]
         return sensors[wanted]
 
-    def _parse(self, path: Path) -> Any:
-        """Read the file and what it includes, and hash all of it."""
+    def _parse(self, path: Path, found: Callable[[str], Path]) -> Any:
+        """Read the file and what it includes, and hash all of it.
+
+        ``found``: the file that is loaded where one is named.
+        """
         mi, parser = self._mi, self._mi.parser
         for name in ("config", "filename"):
             if name in self.parameters:
@@ -425,40 +441,29 @@ class MitsubaRenderer:
             raise SceneError(f"{path}: {_one_line(error)}") from error
         if state.root.type != mi.ObjectType.Scene:
             raise SceneError(f"{path}: expected a <scene> as the outermost element")
-        named = sorted(
-            {
-                str(value)
-                for node in state.nodes
-                for _, value in node.props.items()
-                if isinstance(value, str)
-            }
-        )
-        found = [path.parent / name for name in named if name]
+        values = [value for node in state.nodes for _, value in node.props.items()]
+        named = sorted({str(value) for value in values if isinstance(value, str) and value})
         digest = hashlib.sha256()
         for name, value in sorted(self.parameters.items()):
             digest.update(f"{name}={value}\n".encode())
-        for file in [Path(str(file)) for file in included] + [
-            file for file in found if _is_file(file)
-        ]:
-            with file.open("rb") as content:
-                digest.update(hashlib.file_digest(content, "sha256").digest())
+        for file in (*(Path(str(file)) for file in included), *map(found, named)):
+            if _is_file(file):
+                with file.open("rb") as content:
+                    digest.update(hashlib.file_digest(content, "sha256").digest())
+        # Spectra of files have been read already, and the names are gone.
+        for value in values:
+            if hasattr(value, "wavelengths"):
+                digest.update(np.array([value.wavelengths, value.values]).tobytes())
         self.fingerprint = digest.hexdigest()
         return state
 
     def _instantiate(self, path: Path, state: Any) -> Any:
-        """Build the scene; files that it names are looked for in its own folder first."""
-        mi = self._mi
-        config = mi.parser.ParserConfig(mi.variant())
-        resolver = mi.FileResolver(mi.file_resolver())
-        resolver.prepend(os.fspath(path.resolve().parent))
-        before = mi.file_resolver()
-        mi.set_file_resolver(resolver)
+        """Build the scene."""
+        parser = self._mi.parser
         try:
-            return mi.parser.instantiate(config, state)
+            return parser.instantiate(parser.ParserConfig(self._mi.variant()), state)
         except RuntimeError as error:
             raise SceneError(f"{path}: {_one_line(error)}") from error
-        finally:
-            mi.set_file_resolver(before)
 
     def _sampling_integrator(self, other: Any) -> Any:
         """Return the scene's integrator, or another, if light can be asked of it ray by ray."""
@@ -475,7 +480,7 @@ class MitsubaRenderer:
         if not isinstance(integrator, mi.SamplingIntegrator) or "ADIntegrator" in names:
             raise SceneError(
                 f"{self.name}: expected an integrator that samples single rays, such as path, "
-                f"volpath or direct, got {integrator.class_name()}"
+                f"volpath or direct, got {self._named[0]}"
             )
         name = self._named[0]
         if name == "aov":
@@ -528,8 +533,13 @@ def load_mitsuba(variant: str = "auto") -> Any:
         If mitsuba is not installed, or the variant that was asked for cannot run.
     """
     if variant not in ("auto", *VARIANTS):
-        raise SceneError(f"expected a variant among auto, {', '.join(VARIANTS)}, got {variant!r}")
-    llvm = find_llvm() is not None if variant in ("auto", "llvm_ad_rgb") else False
+        like = variant.removesuffix("_polarized").replace("_mono", "_rgb")
+        raise SceneError(
+            f"expected a variant among {', '.join(VARIANTS)}, got {variant}; those with "
+            "polarization, or with luminance alone, are not rendered, so set "
+            f"{like if like in VARIANTS else 'one of these'} before the scene is loaded"
+        )
+    llvm = find_llvm() is not None if variant == "auto" or "llvm" in variant else False
     try:
         mi = importlib.import_module("mitsuba")
         dr = importlib.import_module("drjit")
@@ -545,20 +555,21 @@ def load_mitsuba(variant: str = "auto") -> Any:
             f"expected LLVM {OLDEST} or newer, got {dr.detail.llvm_version()[0]}, which was loaded "
             f"when mitsuba was imported; call sampling.find_llvm() before that, or set {VARIABLE}"
         )
-    usable = {
-        "cuda_ad_rgb": bool(dr.has_backend(dr.JitBackend.CUDA)),
-        "llvm_ad_rgb": llvm,
-        "scalar_rgb": True,
-    }
+    usable = {"cuda": bool(dr.has_backend(dr.JitBackend.CUDA)), "llvm": llvm, "scalar": True}
     if variant == "auto":
-        variant = next(name for name in VARIANTS if usable[name])
+        variant = next(name for name in RGB_VARIANTS if usable[name.split("_")[0]])
         if variant == "scalar_rgb":
             warnings.warn(
                 "neither a GPU nor an LLVM of version 17 or newer was found: rendering with "
                 f"scalar_rgb, which is slow; install {PACKAGE}, or set {VARIABLE}",
                 stacklevel=2,
             )
-    if not usable[variant]:
+    if variant not in mi.variants():
+        raise SceneError(
+            f"expected a variant that Mitsuba was built with, {', '.join(mi.variants())}, "
+            f"got {variant}"
+        )
+    if not usable[variant.split("_")[0]]:
         need = f"an LLVM; install {PACKAGE}, or set {VARIABLE}" if "llvm" in variant else "a GPU"
         raise SceneError(f"{variant} needs {need}")
     # As on a machine, or in a container, of a single core.
@@ -640,6 +651,24 @@ def _pixel_sampler(variant: str) -> Any:
     return _sampler_class(variant)()
 
 
+@contextlib.contextmanager
+def _files_of(mi: Any, path: Path) -> Iterator[Callable[[str], Path]]:
+    """Look for what a scene names where Mitsuba does; yield what finds the file of a name.
+
+    In the scene's folder, that of the file it is a link to, the working directory and Mitsuba's
+    own. What the scene adds to them by ``<path>`` is gone afterwards.
+    """
+    before = mi.file_resolver()
+    resolver = mi.FileResolver(before)
+    for folder in (path.resolve().parent, path.absolute().parent):
+        resolver.prepend(os.fspath(folder))
+    mi.set_file_resolver(resolver)
+    try:
+        yield lambda name: Path(str(mi.file_resolver().resolve(name)))
+    finally:
+        mi.set_file_resolver(before)
+
+
 def _is_file(path: Path) -> bool:
     try:
         return path.is_file()
@@ -674,7 +703,7 @@ def _integrator_names(mi: Any, state: Any) -> tuple[str, int | None]:
 
 def _innermost(words: str) -> tuple[str, int | None]:
     """Return the same of an integrator that is loaded, from what Mitsuba says of it."""
-    names = re.findall(r"(\w+?)(?:Integrator)?\[\s", words)
+    names = re.findall(r"(\w+?)(?:Integrator)?\[", words)
     depths = [int(depth) for depth in re.findall(r"max_depth = (\d+)", words)]
     # Without a limit it is the largest number of 32 bits.
     depth = depths[-1] if depths and depths[-1] < 2**31 else None
