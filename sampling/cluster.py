@@ -276,6 +276,8 @@ def _done(views: Views, options: argparse.Namespace) -> Done:
             raise
         except ValueError as error:  # of settings, of a checkpoint that cannot be written
             raise ClusterError(str(error)) from error
+        except (RuntimeError, MemoryError) as error:  # of Mitsuba, of this scene
+            return Done([], f"{type(error).__name__}: {printable(str(error)).strip()}")
     mark = "warning: "
     warned = (line.partition(mark)[2] for line in said.getvalue().splitlines() if mark in line)
     return done._replace(warnings=tuple(printable(line) for line in warned))
@@ -286,7 +288,9 @@ def _rendered(views: Views, options: argparse.Namespace) -> Done:
     known = _known(record, options)
     if known is not None:
         return Done(known, stood=True)
-    kept = _kept(options.checkpoint)
+    # Of another picture, which this one is written over.
+    record.unlink(missing_ok=True)
+    kept = _kept(options)
     options.resume = bool(kept)
     try:
         told = views(options)
@@ -303,7 +307,7 @@ def _rendered(views: Views, options: argparse.Namespace) -> Done:
     key = _key(options, *(told[0][name] for name in ("mitsuba", "variant", "fingerprint")))
     with atomic_path(record) as temporary:
         temporary.write_text(json.dumps({"key": key, "views": told}, indent=1) + "\n")
-    for path in _kept(options.checkpoint):
+    for path in _kept(options):
         path.unlink(missing_ok=True)
     return Done(told)
 
@@ -340,8 +344,11 @@ def _known(record: Path, options: argparse.Namespace) -> list[dict[str, Any]] | 
     return views if key == _key(options, scene.version, scene.variant, scene.fingerprint) else None
 
 
-def _kept(checkpoint: Path) -> list[Path]:
+def _kept(options: argparse.Namespace) -> list[Path]:
     """Return the checkpoints of a picture: of its view, or of each of its views, by number."""
+    checkpoint: Path = options.checkpoint
+    if options.sensor != "all":  # numbered ones are of a scene with such a name
+        return [checkpoint] if checkpoint.is_file() else []
     names = (f"{checkpoint.stem}.{number}{checkpoint.suffix}" for number in count())
     views = takewhile(Path.is_file, map(checkpoint.with_name, names))
     return [path for path in (checkpoint, *views) if path.is_file()]

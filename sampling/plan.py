@@ -35,7 +35,7 @@ SHARE = 0.25
 CUTS = (2, 3, 4, 6, 8, 12)
 
 # Samples of each pixel that a pilot must have to tell anything. Pixels at least, for its code takes
-# a quarter of a second to compile, and at most, for it is held in memory, 384 bytes each. Status:
+# a quarter of a second to compile, and at most, for it is held in memory, 576 bytes each. Status:
 # choices.
 FEWEST_SAMPLES, FEWEST_PIXELS, MOST_PIXELS = 16, 2**18, 2**20
 
@@ -240,7 +240,7 @@ class Pilot:
         self._held = []
         if cut is None:
             return
-        if report.forecast < report.samples:
+        if report.forecast <= report.samples:
             self._keep("every bounce: the run is too short for a cut to save anything")
             return
         short = Sampler(self._renderer.size, self._metric, self.sampler.settings)

@@ -9,7 +9,7 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -387,7 +387,12 @@ class _Run:
         try:
             begun = json.loads(state["plan"])
             if begun["piloted"]:
-                return  # it ended within the pilot, of which nothing is kept
+                warnings.warn(
+                    f"{path}: ended within the first round, of which nothing is kept; starting "
+                    "from the beginning",
+                    stacklevel=3,
+                )
+                return
             self._take_over(path, begun)
             self.sampler = Sampler.restore(under("sampler.", state), self.sampler.metric)
             self.samples, self.threads = state["progress.samples"], state["progress.threads"]
@@ -410,6 +415,9 @@ class _Run:
                     f"{path}: begun with --effects {begun['effects']}, and this is {self.effects}; "
                     "give the same, or start anew without --resume"
                 )
+            if self.piloted:
+                reason = f"every bounce: begun with --effects {begun['effects']}"
+                self.plan = replace(self.plan, kept=(*self.plan.kept, reason))
         else:
             self.plan = plan
         self.piloted = False
@@ -432,10 +440,14 @@ class _Run:
             look()
         return pilot
 
-    def _settle(self, pilot: Pilot) -> None:
-        """Take over what the pilot says of the plan."""
+    def _settle(self, pilot: Pilot, report: Report) -> None:
+        """Take over what the pilot says of the plan, unless the run ends with it."""
+        self.piloted = False
+        if report.stop_reason is not None:
+            self.plan = self.plan.ended()
+            return
         pilot.settle()
-        self.sampler, self.plan, self.piloted = pilot.sampler, pilot.plan, False
+        self.sampler, self.plan = pilot.sampler, pilot.plan
 
     def until_done(
         self, watch: Watch, time_limit: float, checkpoint: str | os.PathLike[str] | None
@@ -470,15 +482,15 @@ class _Run:
             pilot = self._draw_pilot(watch, clock, look) if self.piloted else None
             while True:
                 for report in rounds(self.sampler, clock, clock.at_once, look=look, told=told):
+                    if pilot is not None and self.piloted:
+                        self._settle(pilot, report)
+                        if report.stop_reason is None:
+                            break  # from here on by another sampler, where something is left out
                     watch.round(self.report())
                     if report.stop_reason is not None:
                         return report.stop_reason
                     if watch.presses():
                         return "interrupted"
-                    if pilot is not None and self.piloted:
-                        # From here on with another sampler, where something is left out.
-                        self._settle(pilot)
-                        break
         except _EndedError as ending:
             return ending.reason
         finally:

@@ -24,6 +24,7 @@ SCHEDULES = {
     "levels one by one": Schedule(few=0),
     "both images together": Schedule(together=True, few=64),
     "a GPU's": ACCELERATED,
+    "a GPU's, computed again": dataclasses.replace(ACCELERATED, again=True, few=16),
     "strips": Schedule("strips", few=64),
     "computed again": Schedule("strips", again=True, few=16),
     "stacked": Schedule(stacked=True, few=64),
@@ -159,6 +160,10 @@ JOB = Job(1, (400, 400), True, False, False, False, False, False, False)
         (
             {"accelerated": True, "gradients": True, "one_sided": True},
             dataclasses.asdict(ACCELERATED) | {"together": False},
+        ),
+        (
+            {"accelerated": True, "gradients": True, "checkpoints": True},
+            dataclasses.asdict(ACCELERATED) | {"again": True, "few": limits.FEW_NODES},
         ),
         # A graph that somebody else makes has all of it, in one piece.
         ({"size": (1080, 1920), "compiles": True, "traced": True}, {}),

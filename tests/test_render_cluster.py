@@ -1,5 +1,6 @@
 """``vdm-render`` of many pictures on a cluster of Dask, of which a worker dies."""
 
+import argparse
 import json
 import os
 import re
@@ -12,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from sampling import cluster
 from sampling.cli import main
 from sampling.renderers.llvm import LLVMError
 from sampling.renderers.mitsuba import MitsubaRenderer, SceneError, load_mitsuba
@@ -133,6 +135,25 @@ def test_what_is_done_stands_and_what_changed_is_done_again(
     (out / "lamp.exr").unlink()
     assert main([*words, "--resume", "-D", "depth=2"]) == 0
     assert "1 rendered, 1 done before, 0 failed" in capsys.readouterr().out
+
+
+def test_a_record_does_not_outlive_its_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A picture of other settings is written over: killed then, the record would stand for it.
+    options = argparse.Namespace(
+        output=tmp_path / "a.exr", checkpoint=tmp_path / "a.checkpoint", sensor=None
+    )
+    record = tmp_path / "a.json"
+    record.write_text("{}")
+    monkeypatch.setattr(cluster, "_known", lambda *_: None)
+
+    def killed(_: argparse.Namespace) -> Any:
+        assert not record.exists()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        cluster._rendered(killed, options)
 
 
 def test_one_that_cannot_be_rendered_takes_no_other_with_it(

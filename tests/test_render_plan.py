@@ -327,15 +327,11 @@ def test_interrupted_anywhere_the_same_bits(mitsuba: Any, tmp_path: Path) -> Non
     assert whole.figures["plan"]["left_out_jnd"] > 0.0
     reasons: list[str] = []
     # Within the pilot, after its first part; then after a part of the second round.
-    for parts in (1, 3):
-        ended = sampling.render(
-            path,
-            **options,
-            checkpoint=kept,
-            resume=kept if reasons else None,
-            watch=EndsAfter(parts),
-        )
-        reasons.append(ended.stop_reason)
+    ended = sampling.render(path, **options, checkpoint=kept, watch=EndsAfter(1))
+    reasons.append(ended.stop_reason)
+    with pytest.warns(UserWarning, match="within the first round, of which nothing is kept"):
+        ended = sampling.render(path, **options, checkpoint=kept, resume=kept, watch=EndsAfter(3))
+    reasons.append(ended.stop_reason)
     assert reasons == ["interrupted", "interrupted"]
     assert ended.figures["plan"]["left_out_jnd"] > 0.0
     with pytest.raises(CheckpointError, match="begun with --effects auto, and this is full"):
@@ -343,6 +339,29 @@ def test_interrupted_anywhere_the_same_bits(mitsuba: Any, tmp_path: Path) -> Non
     resumed = sampling.render(path, **options, resume=kept)
     np.testing.assert_array_equal(resumed.image, whole.image)
     assert resumed.figures["plan"] == whole.figures["plan"]
+
+
+class EndsItsRound(Watch):
+    """Ends a run with the round that it is in."""
+
+    def presses(self) -> int:
+        """Return 1."""
+        return 1
+
+
+def test_a_first_round_that_is_completed_is_kept(mitsuba: Any, tmp_path: Path) -> None:
+    del mitsuba
+    path, kept = tmp_path / "dim.xml", tmp_path / "kept.npz"
+    path.write_text(DIM)
+    options: dict[str, Any] = {"tolerance": 1.0, "seed": 5}
+    whole = sampling.render(path, **options)
+    first = sampling.render(path, **options, checkpoint=kept, watch=EndsItsRound())
+    assert first.stop_reason == "interrupted"
+    assert first.figures["plan"] == whole.figures["plan"]
+    # No warning, which is an error: nothing is begun anew.
+    resumed = sampling.render(path, **options, resume=kept)
+    np.testing.assert_array_equal(resumed.image, whole.image)
+    assert resumed.figures["samples_total"] == whole.figures["samples_total"]
 
 
 def told(mean: float, deviation: float, count: int = 64) -> Statistics:

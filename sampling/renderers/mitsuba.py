@@ -225,7 +225,8 @@ class MitsubaRenderer:
         finally:
             self._integrator, self._aov_at = before
             self._told = slice(0)
-        return Bounced(samples, np.stack(beside[:-1], -1), beside[-1])
+        segments = (beside[-1] / self.pixel_filter.rays).astype(np.float32)
+        return Bounced(samples, np.stack(beside[:-1], -1), segments)
 
     def simulate(self, max_depth: int | None) -> None:
         """Render with ``path`` of so many segments in place of the scene's own integrator."""

@@ -109,7 +109,8 @@ def _rough(mi: Any, bsdf: Any, flags: int) -> bool:
 
 def _black(mi: Any, bsdf: Any) -> bool:
     """Return whether a material is known to reflect nothing."""
-    if bsdf.class_name() != "SmoothDiffuse":
+    # Of spectral variants these are no reflectances.
+    if bsdf.class_name() != "SmoothDiffuse" or mi.is_spectral:
         return False
     value = dict(mi.traverse(bsdf)).get("reflectance.value")
     return value is not None and not np.asarray(value).any()

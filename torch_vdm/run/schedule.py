@@ -95,8 +95,11 @@ class Schedule(Steps):
 
     def pixels(self, function: Callable[..., Tensor], *planes: Tensor) -> Tensor:
         """Return a function of pixels, a few rows at a time."""
-        if self.compiled or not self.cached:
+        if self.compiled:
             return function(*planes)
+        if not self.cached:
+            whole: Tensor = self.part(function, *planes)
+            return whole
         rows = self.rows(planes[0].shape[-2], planes[0].numel(), LARGEST_AT_ONCE)
         parts = zip(*(plane.split(rows, -2) for plane in planes), strict=True)
         return torch.cat([self.part(function, *part) for part in parts], -2)
@@ -135,7 +138,8 @@ def chosen(job: Job) -> Schedule:
             compiled=compiles,
             again=again,
             cached=False,
-            few=EVERY_LEVEL,
+            # Levels at once keep all that they compute.
+            few=FEW_NODES if again else EVERY_LEVEL,
         )
     large = math.prod(job.size) >= 2 * STRIP
     strips = large and not job.traced and (job.checkpoints or not job.gradients)
