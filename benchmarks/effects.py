@@ -17,6 +17,7 @@ from torch import Tensor
 
 from benchmarks import record, transport
 from benchmarks.pictures import distorted, grainy, photographs, renders
+from benchmarks.transport import draw_times, times_as_fast
 from torch_vdm import VDM, Effects
 
 THREADS = 2
@@ -185,19 +186,14 @@ def table(result: dict[str, Any]) -> str:
         )
     lines += ["", "| target | wanted | found | |", "|---|---|---|---|"]
     for name, wanted in WANTED.items():
-        times = _times(result, name)
+        times = times_as_fast(result["pairs"][name])
         verdict = "met" if times >= wanted else "**not met**"
         lines.append(f"| {name}, times as fast | {wanted:.1f} | {times:.2f} | {verdict} |")
     busy = [name for name, of in result["pairs"].items() if not of["left_out"]]
-    busiest = max(1.0 / _times(result, name) for name in busy)
+    busiest = max(1.0 / times_as_fast(result["pairs"][name]) for name in busy)
     verdict = "met" if busiest <= BUSIEST else "**not met**"
     lines.append(f"| nothing left out, times as slow | {BUSIEST:.2f} | {busiest:.2f} | {verdict} |")
     return "\n".join(lines) + "\n"
-
-
-def _times(result: dict[str, Any], name: str) -> float:
-    seconds = result["pairs"][name]["seconds"]
-    return float(seconds["full"] / seconds["auto"])
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
@@ -221,14 +217,8 @@ def plot(result: dict[str, Any], path: Path) -> None:
     left.set_ylabel("largest difference it makes, JND")
     left.set_title("One effect left out, each pair", fontsize=10)
     left.legend(fontsize=8, frameon=False)
-    names = list(pairs_of)
-    times = [_times(result, name) for name in names]
-    right.barh(range(len(names)), times, color="C0")
-    right.set_yticks(range(len(names)), names, fontsize=8)
-    right.invert_yaxis()
-    right.axvline(1.0, color="0.3", linewidth=0.8)
+    draw_times(right, list(pairs_of), list(map(times_as_fast, pairs_of.values())))
     right.set_xscale("log")
-    right.set_xlabel('times as fast with effects="auto"')
     right.set_title("Nothing lost", fontsize=10)
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)

@@ -77,8 +77,19 @@ def count(function: Contender, test: Tensor, reference: Tensor) -> int:
 
 
 def _of_a_gpu(gradients: bool) -> Schedule:
-    job = Job(1, FULL_HD, True, gradients, gradients, False, False, True, False)
-    return chosen(job)
+    return chosen(
+        Job(
+            items=1,
+            size=FULL_HD,
+            stackable=True,
+            gradients=gradients,
+            one_sided=gradients,  # of a loss, by its test alone
+            compiles=False,
+            checkpoints=False,
+            accelerated=True,
+            traced=False,
+        )
+    )
 
 
 def _step(loss: Contender) -> Contender:

@@ -11,7 +11,7 @@ run beside lengthen both alike.
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -287,8 +287,21 @@ def table(result: dict[str, Any]) -> str:
 
 
 def _times(of: dict[str, Any]) -> float:
-    seconds = of["run"]["seconds"]
-    return float(seconds["full"] / seconds["auto"])
+    return times_as_fast(of["run"])
+
+
+def times_as_fast(of: dict[str, Any]) -> float:
+    """Return how many times as fast ``auto`` is as ``full``, by their ``seconds``."""
+    return float(of["seconds"]["full"] / of["seconds"]["auto"])
+
+
+def draw_times(axes: Any, names: Sequence[str], times: Sequence[float]) -> None:
+    """Draw how many times as fast ``auto`` is, a bar each."""
+    axes.barh(range(len(names)), times, color="C0")
+    axes.set_yticks(range(len(names)), names, fontsize=7)
+    axes.invert_yaxis()
+    axes.axvline(1.0, color="0.3", linewidth=0.8)
+    axes.set_xlabel('times as fast with effects="auto"')
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
@@ -311,12 +324,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
     left.set_ylabel("largest difference it makes, JND")
     left.set_title("Media, or paths over 2, 3, 4, ... segments left out", fontsize=10)
     left.legend(fontsize=6, frameon=False)
-    names = list(found)
-    right.barh(range(len(names)), [_times(found[name]) for name in names], color="C0")
-    right.set_yticks(range(len(names)), [OWN.get(name, name) for name in names], fontsize=7)
-    right.invert_yaxis()
-    right.axvline(1.0, color="0.3", linewidth=0.8)
-    right.set_xlabel('times as fast with effects="auto"')
+    draw_times(right, [OWN.get(name, name) for name in found], list(map(_times, found.values())))
     right.set_title(f"Whole runs, {result['tolerance']:g} JND", fontsize=10)
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)

@@ -1,6 +1,7 @@
 """Where test data lives, what images tests are made of, and the reference's observer."""
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,21 @@ def mitsuba() -> Any:
 
 
 KINDS = ("random", "flat", "black", "hdr", "dark", "negative")
+
+
+def one_line_error(
+    main: Callable[[Sequence[str]], int], capsys: pytest.CaptureFixture[str], *arguments: str
+) -> str:
+    """Return the one line on standard error of a command that ends with 2."""
+    try:
+        status = main(arguments)
+    except SystemExit as ending:
+        status = int(ending.code or 0)
+    told = capsys.readouterr()
+    assert status == 2
+    assert told.out == ""
+    assert told.err.count("\n") == 1
+    return told.err
 
 
 def make_xyz(kind: str, height: int, width: int, seed: int) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ import PIL.Image
 import pytest
 import torch
 
+from tests.conftest import one_line_error
 from tests.test_colour import chunk, with_chunks
 from tests.test_io import ACES, hand_made_exr, png16, rgb, write_exr
 from torch_vdm import VDM, Display, Haar, StationaryHaar, Steerable, __version__
@@ -39,19 +40,6 @@ def run_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, o
     assert main(["compare", *arguments, "--json", "-"]) == 0
     figures: dict[str, object] = json.loads(capsys.readouterr().out)
     return figures
-
-
-def one_line_error(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Return the one line on standard error of a command that ends with 2."""
-    try:
-        status = main(arguments)
-    except SystemExit as ending:
-        status = int(ending.code or 0)
-    told = capsys.readouterr()
-    assert status == 2
-    assert told.out == ""
-    assert told.err.count("\n") == 1
-    return told.err
 
 
 def test_json_has_the_figures_of_the_metric(pair: Pair, capsys: pytest.CaptureFixture[str]) -> None:
@@ -171,7 +159,7 @@ def test_wrong_options_get_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.iterdir())
-    assert words in one_line_error(capsys, "compare", *pair, *options)
+    assert words in one_line_error(main, capsys, "compare", *pair, *options)
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -181,7 +169,7 @@ def test_outputs_never_take_the_place_of_inputs_or_of_each_other(
     before = Path(pair[0]).read_bytes()
     shared = str(tmp_path / "both.png")
     for options in (["--map", pair[0]], ["--json", pair[0]], ["--map", shared, "--json", shared]):
-        line = one_line_error(capsys, "compare", *pair, *options)
+        line = one_line_error(main, capsys, "compare", *pair, *options)
         assert "expected a file of its own" in line
     assert Path(pair[0]).read_bytes() == before
     assert not Path(shared).exists()
@@ -205,12 +193,12 @@ def test_wrong_files_get_one_line(
     write_image(tmp_path / "small.png", torch.zeros(3, 4, 5))
     (tmp_path / "empty.exr").touch()
     (tmp_path / "words.png").write_text("not a picture")
-    small = one_line_error(capsys, "compare", pair[0], str(tmp_path / "small.png"))
+    small = one_line_error(main, capsys, "compare", pair[0], str(tmp_path / "small.png"))
     assert "small.png: expected the size of" in small
     assert "30 x 20, got 5 x 4" in small
     for name in ("empty.exr", "words.png", "missing.png"):
-        assert name in one_line_error(capsys, "compare", pair[0], str(tmp_path / name))
-    assert "got a folder" in one_line_error(capsys, "compare", pair[0], str(tmp_path))
+        assert name in one_line_error(main, capsys, "compare", pair[0], str(tmp_path / name))
+    assert "got a folder" in one_line_error(main, capsys, "compare", pair[0], str(tmp_path))
 
 
 def test_nonfinite_and_negative_values_are_refused_or_repaired(
@@ -221,10 +209,12 @@ def test_nonfinite_and_negative_values_are_refused_or_repaired(
     image[1, 2, 3], image[0, 4, 1] = float("nan"), -0.25
     write_image(tmp_path / "bad.exr", image)
     paths = [str(tmp_path / name) for name in ("good.exr", "bad.exr")]
-    line = one_line_error(capsys, "compare", *paths)
+    line = one_line_error(main, capsys, "compare", *paths)
     assert "bad.exr" in line
     assert "--nonfinite zero" in line
-    assert "--negative clip" in one_line_error(capsys, "compare", *paths, "--nonfinite", "zero")
+    assert "--negative clip" in one_line_error(
+        main, capsys, "compare", *paths, "--nonfinite", "zero"
+    )
     told = run_json(capsys, *paths, "--nonfinite", "zero", "--negative", "clip")
     assumptions = told["assumptions"]
     assert isinstance(assumptions, list)
@@ -294,7 +284,7 @@ def test_the_papers_observer_has_the_papers_transform(
 
 
 def test_an_unknown_accuracy_is_refused(pair: Pair, capsys: pytest.CaptureFixture[str]) -> None:
-    told = one_line_error(capsys, "compare", *pair, "--accuracy", "best")
+    told = one_line_error(main, capsys, "compare", *pair, "--accuracy", "best")
     assert "fast" in told
     assert "reference" in told
 
@@ -314,7 +304,7 @@ def test_tiles_give_the_same_figures(
     assert "--tile 8" in str(tiled["reproduce"])
     for name in ("max_jnd", "mean_jnd", "p95_jnd", "visible_fraction", "score_jnd"):
         assert tiled[name] == pytest.approx(whole[name], abs=1e-5)
-    assert "4 or more" in one_line_error(capsys, "compare", *pair, "--tile", "2")
+    assert "4 or more" in one_line_error(main, capsys, "compare", *pair, "--tile", "2")
     # Arrays on a disk, the codes of the same pictures: whole, and in tiles.
     arrays = []
     for name, path in zip(("reference", "test"), pair, strict=True):
@@ -335,7 +325,7 @@ def test_tiles_give_the_same_figures(
     in_one = run_json(capsys, linear, pair[1])["max_jnd"]
     assert told["max_jnd"] == pytest.approx(in_one, abs=1e-5, rel=2e-6)
     np.save(linear, np.full((3, 20, 30), np.nan, np.float32))
-    assert "linear.npy: expected finite" in one_line_error(capsys, "compare", linear, linear)
+    assert "linear.npy: expected finite" in one_line_error(main, capsys, "compare", linear, linear)
 
 
 # --- Files as people have them --------------------------------------------------------------------
@@ -452,7 +442,7 @@ def test_eyes_are_matched_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[
     lacking = "more.exr: views that the other file lacks are not compared: centre"
     assert lacking in str(more["assumptions"])
     centre = write_eyes(tmp_path / "centre.exr", {"centre": left})
-    line = one_line_error(capsys, "compare", one, centre)
+    line = one_line_error(main, capsys, "compare", one, centre)
     assert "expected a view that" in line
     assert "(left, right), got centre; render the same views" in line
 
@@ -465,8 +455,8 @@ def test_channels_are_named_on_the_command_line(
     write_channels(tmp_path / "one.exr", dict(zip(("x", "y.z", "w"), image, strict=True)))
     write_image(tmp_path / "other.exr", image)
     paths = [str(tmp_path / name) for name in ("one.exr", "other.exr")]
-    assert "--channels" in one_line_error(capsys, "compare", *paths)
-    line = one_line_error(capsys, "compare", *paths, "--channels", "R=x,G=y.z")
+    assert "--channels" in one_line_error(main, capsys, "compare", *paths)
+    line = one_line_error(main, capsys, "compare", *paths, "--channels", "R=x,G=y.z")
     assert "expected R=NAME,G=NAME,B=NAME" in line
     write_channels(tmp_path / "other.exr", dict(zip(("x", "y.z", "w"), image, strict=True)))
     told = run_json(capsys, *paths, "--channels", "r=x,g=y.z,b=w")
@@ -496,7 +486,7 @@ def test_infinity_is_held_to_the_largest_half(
     for name, largest in (("inf.exr", np.inf), ("max.exr", 65504)):
         values[:, 4, 4] = largest
         paths.append(str(write_exr(tmp_path / name, rgb(values))))
-    assert "--nonfinite clamp" in one_line_error(capsys, "compare", *paths)
+    assert "--nonfinite clamp" in one_line_error(main, capsys, "compare", *paths)
     told = run_json(capsys, *paths, "--nonfinite", "clamp")
     assert told["max_jnd"] == 0.0
     assert "Infinity was held to 65504" in str(told["assumptions"])
@@ -533,7 +523,7 @@ def test_arrays_that_are_refused(
     tmp_path: Path, dtype: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     np.save(tmp_path / "image.npy", np.zeros((3, 8, 9), dtype))
-    line = one_line_error(capsys, "compare", *[str(tmp_path / "image.npy")] * 2)
+    line = one_line_error(main, capsys, "compare", *[str(tmp_path / "image.npy")] * 2)
     assert "image.npy: expected numbers of uint8, uint16, float16" in line
     assert f"got {dtype}" in line
 
@@ -554,7 +544,7 @@ def test_damaged_arrays_are_refused(
     path = tmp_path / "image.npy"
     size = struct.pack("<H", len(header))
     path.write_bytes(b"\x93NUMPY\1\0" + size + header.encode() + bytes(192))
-    line = one_line_error(capsys, "compare", str(path), str(path))
+    line = one_line_error(main, capsys, "compare", str(path), str(path))
     assert "image.npy: damaged or no array: " in line
 
 
@@ -583,7 +573,7 @@ def test_floats_may_be_coded(
     aces = write_exr(
         tmp_path / "aces.exr", rgb(np.ones((3, 20, 30), np.float32)), chromaticities=ACES
     )
-    line = one_line_error(capsys, "compare", str(aces), files[0], "--coded")
+    line = one_line_error(main, capsys, "compare", str(aces), files[0], "--coded")
     assert "leave out --coded" in line
 
 
@@ -669,7 +659,7 @@ def test_errors_of_our_own_are_not_bad_input(
 def test_options_that_the_model_refuses_are_bad_input(
     pair: Pair, options: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "expected" in one_line_error(capsys, "compare", *pair, *options)
+    assert "expected" in one_line_error(main, capsys, "compare", *pair, *options)
 
 
 def test_only_tiles_need_a_folder(

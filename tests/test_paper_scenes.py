@@ -12,9 +12,10 @@ from scipy import stats
 from benchmarks.paper import AIMED, ISOLUMINANT, SCENES
 from benchmarks.scenes.carpet import FILE, carpet
 from sampling import Sampler, Settings
-from sampling.renderers.llvm import LLVMError
-from sampling.renderers.mitsuba import MitsubaRenderer, SceneError, load_mitsuba
+from sampling.renderers.mitsuba import MitsubaRenderer
 from torch_vdm import VDM, Display, Observer
+
+pytestmark = pytest.mark.usefixtures("mitsuba")
 
 Plane = NDArray[np.float64]
 
@@ -26,15 +27,6 @@ SIGNIFICANCE = 1e-3
 
 # The light's radius as it is seen from the sphere; contrast.xml.
 RADIUS = math.radians(23.0)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def mitsuba() -> None:
-    """Skip where Mitsuba cannot run."""
-    try:
-        load_mitsuba("llvm_ad_rgb")
-    except (SceneError, LLVMError) as error:
-        pytest.skip(str(error))
 
 
 def draw(path: Path, parameters: dict[str, str], count: int, seed: int = 0) -> Plane:

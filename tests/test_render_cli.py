@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from benchmarks.places import ROOT
 from sampling import Samples, rendering
 from sampling.cli import main
-from sampling.renderers.llvm import LLVMError, find_llvm
-from sampling.renderers.mitsuba import MitsubaRenderer, SceneError, load_mitsuba
+from sampling.renderers.llvm import find_llvm
+from sampling.renderers.mitsuba import MitsubaRenderer
+from tests.conftest import one_line_error
 from torch_vdm.io import load, write_channels
 
 # FACE.md: what acceptance reads.
@@ -45,12 +46,9 @@ sys.exit(cli.main())
 
 
 @pytest.fixture(scope="module")
-def scene() -> str:
-    """Return the scene that ships; what needs Mitsuba is skipped where it cannot run."""
-    try:
-        load_mitsuba("llvm_ad_rgb")
-    except (SceneError, LLVMError) as error:
-        pytest.skip(str(error))
+def scene(mitsuba: Any) -> str:
+    """Return the scene that ships."""
+    del mitsuba
     with as_file(files("sampling") / "scenes" / "still_life.xml") as path:
         return str(path)
 
@@ -378,15 +376,7 @@ def test_bad_input_is_refused_in_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     given = [scene if word == "SCENE" else word for word in words]
-    try:
-        status = main(["--output", "out.exr", *given])
-    except SystemExit as ending:
-        status = int(ending.code or 0)
-    told = capsys.readouterr()
-    assert status == 2
-    assert told.out == ""
-    assert said in told.err
-    assert told.err.count("\n") == 1
+    assert said in one_line_error(main, capsys, "--output", "out.exr", *given)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -15,11 +15,13 @@ import pytest
 
 from sampling import cluster
 from sampling.cli import main
-from sampling.renderers.llvm import LLVMError
-from sampling.renderers.mitsuba import MitsubaRenderer, SceneError, load_mitsuba
+from sampling.renderers.mitsuba import MitsubaRenderer
+from tests.conftest import one_line_error
 from tests.test_render_cli import same_image
 
 distributed = pytest.importorskip("distributed")
+
+pytestmark = pytest.mark.usefixtures("mitsuba")
 
 # A lamp over a floor, which a frame's number moves.
 SCENE = """<scene version="3.0.0">
@@ -34,14 +36,6 @@ up="0, 1, 0"/></transform><film type="hdrfilm"><integer name="width" value="12"/
 <emitter type="area"><rgb name="radiance" value="4"/></emitter></shape></scene>"""
 
 OPTIONS = ("--tolerance", "1.5", "--seed", "3")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _mitsuba() -> None:
-    try:
-        load_mitsuba("llvm_ad_rgb")
-    except (SceneError, LLVMError) as error:
-        pytest.skip(str(error))
 
 
 @pytest.fixture
@@ -220,10 +214,4 @@ def test_options_that_do_not_fit_get_one_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    try:
-        status = main(["--output", "out", *words, scene.name])
-    except SystemExit as ending:
-        status = int(ending.code or 0)
-    told = capsys.readouterr()
-    assert (status, told.out, told.err.count("\n")) == (2, "", 1)
-    assert said in told.err
+    assert said in one_line_error(main, capsys, "--output", "out", *words, scene.name)

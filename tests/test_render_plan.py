@@ -1,6 +1,7 @@
 """What of a scene is left out: nothing that shows, and with what is kept the same bits."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
@@ -28,10 +29,12 @@ Scene = dict[str, Any]
 Picture = NDArray[np.float64]
 
 
-@pytest.fixture(autouse=True)
-def small_pilots(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module", autouse=True)
+def small_pilots() -> Iterator[None]:
     # Of pictures that are too small for it to pay.
-    monkeypatch.setattr(plans, "FEWEST_PIXELS", 1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plans, "FEWEST_PIXELS", 1)
+        yield
 
 
 def grey(*colour: float) -> Scene:
@@ -305,6 +308,8 @@ class EndsAfter(Watch):
         return 0 if self._left > 0 else 2
 
 
+OPTIONS: dict[str, Any] = {"tolerance": 1.0, "seed": 5}
+
 DIM = """<scene version="3.0.0">
 <integrator type="path"><integer name="max_depth" value="32"/>
   <integer name="rr_depth" value="64"/></integrator>
@@ -318,25 +323,34 @@ DIM = """<scene version="3.0.0">
   <emitter type="area"><rgb name="radiance" value="30"/></emitter></shape></scene>"""
 
 
-def test_interrupted_anywhere_the_same_bits(mitsuba: Any, tmp_path: Path) -> None:
-    del mitsuba
-    path, kept = tmp_path / "dim.xml", tmp_path / "kept.npz"
+@pytest.fixture(scope="module")
+def dim(
+    mitsuba: Any, small_pilots: None, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, sampling.Result]:
+    """Return a scene that is cut, and its picture with `OPTIONS`."""
+    del mitsuba, small_pilots
+    path = tmp_path_factory.mktemp("dim") / "dim.xml"
     path.write_text(DIM)
-    options: dict[str, Any] = {"tolerance": 1.0, "seed": 5}
-    whole = sampling.render(path, **options)
+    return path, sampling.render(path, **OPTIONS)
+
+
+def test_interrupted_anywhere_the_same_bits(
+    dim: tuple[Path, sampling.Result], tmp_path: Path
+) -> None:
+    (path, whole), kept = dim, tmp_path / "kept.npz"
     assert whole.figures["plan"]["left_out_jnd"] > 0.0
     reasons: list[str] = []
     # Within the pilot, after its first part; then after a part of the second round.
-    ended = sampling.render(path, **options, checkpoint=kept, watch=EndsAfter(1))
+    ended = sampling.render(path, **OPTIONS, checkpoint=kept, watch=EndsAfter(1))
     reasons.append(ended.stop_reason)
     with pytest.warns(UserWarning, match="within the first round, of which nothing is kept"):
-        ended = sampling.render(path, **options, checkpoint=kept, resume=kept, watch=EndsAfter(3))
+        ended = sampling.render(path, **OPTIONS, checkpoint=kept, resume=kept, watch=EndsAfter(3))
     reasons.append(ended.stop_reason)
     assert reasons == ["interrupted", "interrupted"]
     assert ended.figures["plan"]["left_out_jnd"] > 0.0
     with pytest.raises(CheckpointError, match="begun with --effects auto, and this is full"):
-        sampling.render(path, **options, effects="full", resume=kept)
-    resumed = sampling.render(path, **options, resume=kept)
+        sampling.render(path, **OPTIONS, effects="full", resume=kept)
+    resumed = sampling.render(path, **OPTIONS, resume=kept)
     np.testing.assert_array_equal(resumed.image, whole.image)
     assert resumed.figures["plan"] == whole.figures["plan"]
 
@@ -349,17 +363,15 @@ class EndsItsRound(Watch):
         return 1
 
 
-def test_a_first_round_that_is_completed_is_kept(mitsuba: Any, tmp_path: Path) -> None:
-    del mitsuba
-    path, kept = tmp_path / "dim.xml", tmp_path / "kept.npz"
-    path.write_text(DIM)
-    options: dict[str, Any] = {"tolerance": 1.0, "seed": 5}
-    whole = sampling.render(path, **options)
-    first = sampling.render(path, **options, checkpoint=kept, watch=EndsItsRound())
+def test_a_first_round_that_is_completed_is_kept(
+    dim: tuple[Path, sampling.Result], tmp_path: Path
+) -> None:
+    (path, whole), kept = dim, tmp_path / "kept.npz"
+    first = sampling.render(path, **OPTIONS, checkpoint=kept, watch=EndsItsRound())
     assert first.stop_reason == "interrupted"
     assert first.figures["plan"] == whole.figures["plan"]
     # No warning, which is an error: nothing is begun anew.
-    resumed = sampling.render(path, **options, resume=kept)
+    resumed = sampling.render(path, **OPTIONS, resume=kept)
     np.testing.assert_array_equal(resumed.image, whole.image)
     assert resumed.figures["samples_total"] == whole.figures["samples_total"]
 

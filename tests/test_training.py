@@ -23,8 +23,6 @@ from benchmarks.renders import (
 )
 from benchmarks.rooms import room
 from benchmarks.unet import UNet, crops, denoise, train
-from sampling.renderers.llvm import LLVMError
-from sampling.renderers.mitsuba import SceneError, load_mitsuba
 from torch_vdm.model.display import encode_srgb
 
 
@@ -59,11 +57,8 @@ def test_rooms_follow_from_their_seeds() -> None:
     assert len({room(seed) for seed in range(50)}) == 50
 
 
+@pytest.mark.usefixtures("mitsuba")
 def test_a_room_is_rendered_exposed_and_kept(tmp_path: Path) -> None:
-    try:
-        load_mitsuba("llvm_ad_rgb")
-    except (SceneError, LLVMError) as error:
-        pytest.skip(str(error))
     options = {"side": 12, "takes": 2, "noisy_spp": 4, "reference_spp": 70}
     first = picture(Scene("room 3", room(3)), tmp_path, **options)
     assert first.noisy.shape == (2, CHANNELS, 12, 12)

@@ -1,4 +1,4 @@
-"""The figures of a frame by name, and the files that hold them: JSON, CSV, Parquet, JUnit XML."""
+"""The files that hold the figures of all frames: JSON, CSV, Parquet, JUnit XML."""
 
 import csv
 import json

@@ -30,7 +30,6 @@ SOFT, POWER = 0.005, 4
 # it, and else in proportion. Status: choice, measured.
 FAINT = 0.1
 
-
 # In a cache, planes with more numbers are summed up along one side and the other. Status:
 # choice, measured.
 SMALL = 2**10
@@ -60,7 +59,7 @@ def changes(first: Tensor, second: Tensor) -> Tensor:
 
 
 def charge(
-    change: Tensor, shifts: int, filtered: bool, items: int = 1, in_cache: bool = False
+    change: Tensor, shifts: int, filtered: bool, items: int = 1, cached: bool = False
 ) -> Charge:
     """Return what every node of a level is charged.
 
@@ -74,12 +73,12 @@ def charge(
         Whether what is decomposed was filtered.
     items
         How many images lie below one another.
-    in_cache
-        As `Steps.in_cache`.
+    cached
+        As `Steps.cached`.
     """
     # Every image by itself.
     planes = change if items == 1 else apart(change[0, 0], items).unsqueeze(1)
-    near, around = (_mean_around(planes, nodes * shifts, in_cache) for nodes in (NEAR, AROUND))
+    near, around = (_mean_around(planes, nodes * shifts, cached) for nodes in (NEAR, AROUND))
     ratio = near / around.clamp_min(torch.finfo(around.dtype).tiny)
     if items > 1:
         ratio = together(ratio.squeeze(1))[None, None]
@@ -88,11 +87,11 @@ def charge(
     return Charge(inherited**POWER, None if own is None else own**POWER)
 
 
-def _mean_around(plane: Tensor, nodes: int, in_cache: bool) -> Tensor:
+def _mean_around(plane: Tensor, nodes: int, cached: bool) -> Tensor:
     """Return the mean over so many nodes to each side, the border repeated."""
     padded = functional.pad(plane, (nodes,) * 4, mode="replicate")
     side = 2 * nodes + 1
-    if not in_cache or plane.numel() <= SMALL:
+    if not cached or plane.numel() <= SMALL:
         return functional.avg_pool2d(padded, side, 1)
     return _sums(_sums(padded, side, -1), side, -2) / float(side * side)
 

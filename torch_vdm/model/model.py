@@ -257,7 +257,7 @@ class Model:
         """Return what the nodes of each level are charged; None: all."""
         if not self.observer.charging:
             return None
-        options = self.transform.shifts, self.transform.csf == "filter", items, self.steps.in_cache
+        options = self.transform.shifts, self.transform.csf == "filter", items, self.steps.cached
         return [self.steps(charge, change, *options) for change in changes]
 
     def grid(self, size: tuple[int, int]) -> Grid:

@@ -9,14 +9,12 @@ from torch import Tensor
 class Steps:
     """Calls the steps of the model one after the other, each as it is; executors derive others."""
 
+    cached: bool = False
+    """Whether large planes are computed in parts that stay in a processor's cache."""
+
     @property
     def fused(self) -> bool:
         """Whether the operations of a step become one, and a step for special cases costs more."""
-        return False
-
-    @property
-    def in_cache(self) -> bool:
-        """Whether large planes are computed in more and smaller operations than they need."""
         return False
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:

@@ -28,6 +28,8 @@ BAND_STRIP = 2**17
 # Levels of at most as many nodes are computed at once: there an operation costs more than the
 # numbers that it works on. Status: choice, measured.
 FEW_NODES = 64 * 64
+
+# More nodes than a level has.
 EVERY_LEVEL = 2**62
 
 
@@ -67,7 +69,7 @@ class Schedule(Steps):
     again: bool = False
     """Whether the backward pass computes parts again, of which their arguments are kept."""
     cached: bool = True
-    """Whether large planes are computed in parts that stay in a processor's cache."""
+    """As `Steps.cached`."""
     few: int = field(default_factory=lambda: FEW_NODES)
     """Levels of at most so many nodes are computed at once."""
 
@@ -75,11 +77,6 @@ class Schedule(Steps):
     def fused(self) -> bool:
         """As `Steps.fused`."""
         return self.compiled
-
-    @property
-    def in_cache(self) -> bool:
-        """As `Steps.in_cache`."""
-        return self.cached
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return what a step returns, by its compiled form where that pays."""
@@ -128,7 +125,6 @@ class Schedule(Steps):
 
 def chosen(job: Job) -> Schedule:
     """Return how a job is best done."""
-    # With gradients strips take less memory and more time, as checkpoints do.
     compiles = job.compiles and not job.traced
     again = job.checkpoints and job.gradients and not job.traced
     if job.accelerated:
@@ -141,6 +137,7 @@ def chosen(job: Job) -> Schedule:
             # Levels at once keep all that they compute.
             few=FEW_NODES if again else EVERY_LEVEL,
         )
+    # With gradients strips take less memory and more time, as checkpoints do.
     large = math.prod(job.size) >= 2 * STRIP
     strips = large and not job.traced and (job.checkpoints or not job.gradients)
     small = job.items * 3 * math.prod(job.size) <= LARGEST_AT_ONCE
