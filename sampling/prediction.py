@@ -186,7 +186,7 @@ class Model:
         single precision.
         """
         logarithm = torch.zeros(self.size, dtype=torch.float32, requires_grad=True)
-        truth = _each(truth, Tensor.float)
+        truth = truth.each(Tensor.float)
         totals = self._totals(self.variance.float() * torch.exp(-logarithm), truth)
         largest = totals.detach().amax().clamp_min(1e-300)
         power = SHARPNESS / self.exponent
@@ -282,16 +282,11 @@ class Model:
 
     def _judge(self, truth: Cortex) -> Callable[[Cortex], Tensor]:
         """Return what finds the totals, (B, 1, h, w), that noises add to an image."""
-        first = _each(truth, Tensor.float)
+        first = truth.each(Tensor.float)
         compare = self.metric.beside(first)
 
         def seen(noise: Cortex) -> Tensor:
-            details, lowpass = (
-                tuple(a + b for a, b in zip(*planes, strict=True))
-                for planes in ((first.details, noise.details), (first.lowpass, noise.lowpass))
-            )
-            mean = first.mean + noise.mean
-            return compare(first._replace(details=details, lowpass=lowpass, mean=mean)).double()
+            return compare(first.each(torch.add, noise)).double()
 
         return seen
 
@@ -424,13 +419,4 @@ def _factor(covariance: Tensor) -> Tensor:
     zero = torch.zeros_like(a)
     return torch.stack(
         (torch.stack((a, zero, zero)), torch.stack((b, d, zero)), torch.stack((c, e, f)))
-    )
-
-
-def _each(cortex: Cortex, function: Callable[[Tensor], Tensor]) -> Cortex:
-    """Return the representation with every plane as a function makes it."""
-    return cortex._replace(
-        details=tuple(map(function, cortex.details)),
-        lowpass=tuple(map(function, cortex.lowpass)),
-        mean=function(cortex.mean),
     )

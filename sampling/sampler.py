@@ -26,7 +26,7 @@ StopReason = Literal["tolerance", "noise_threshold", "max_spp"]
 StrategyName = Literal["perceptual", "objective", "uniform", "halfbuffer"]
 
 # What `state` is made of. Raised when an older state would be continued differently.
-STATE_VERSION = 7
+STATE_VERSION = 8
 
 # Share of the tolerance that a round aims at, for a prediction is not exact. Status: choice.
 AIM = 0.98
@@ -335,14 +335,10 @@ class Sampler:
         model = Model(self.metric, statistics, self.size, look)
         predicted = model.predicted_maximum(self.settings.tolerance)
         totals = model.totals()
-        largest = float(totals.max()) ** (1.0 / model.exponent)
         # The boundary images say where, the simulation how much.
-        scale = predicted / largest if largest > 0.0 else 1.0
-        jnd = (
-            push(totals, self.size, before=model.cortex.grid.before(0))[0, 0].numpy()
-            ** (1.0 / model.exponent)
-            * scale
-        )
+        shares = totals / totals.amax().clamp_min(1e-300)
+        pixels = push(shares, self.size, before=model.cortex.grid.before(0))[0, 0].numpy()
+        jnd = predicted * pixels ** (1.0 / model.exponent)
         drawn = int((statistics.first + statistics.drawn).sum())
         forecast, reason = 0, self._decided
         if reason is None:

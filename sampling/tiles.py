@@ -127,10 +127,11 @@ class LocalErrors:
         nodes = [detail.shape[-2] * detail.shape[-1] for detail in truth.details]
         few = sum(count <= FEW_NODES for count in nodes)
         details = [detail.float() for detail in truth.details]
-        lowpass = [plane.float() for plane in truth.lowpass]
+        # To which the eye is adapted.
+        windows = [plane.float() for plane in truth.windows or truth.lowpass]
         self._coarse = Cortex(
             tuple(details[:few]),
-            tuple(lowpass[: max(few, 1)]),
+            tuple(windows[: max(few, 1)]),
             truth.mean,
             len(nodes) - few,
             grid=truth.grid,
@@ -138,7 +139,7 @@ class LocalErrors:
         self._levels = [
             _Level(
                 details[number],
-                lowpass[number - 1],
+                windows[number - 1],
                 len(nodes) - 1 - number,
                 truth.before[number],
             )

@@ -13,7 +13,7 @@ from torch_vdm.model.contrast import (
     opponents,
     weber_contrast,
 )
-from torch_vdm.model.cortex import Haar
+from torch_vdm.model.cortex import Haar, StationaryHaar
 from torch_vdm.model.quadtree import push
 
 DARK_LIGHT = 0.3
@@ -47,6 +47,24 @@ def test_contrast_by_the_parent_is_at_most_four() -> None:
     adaptation = adapted(cortex.parent_lowpass(1), torch.zeros(3)).reciprocal()
     contrast = local_contrast(cortex.details[1], push(adaptation, (2, 2)))
     assert contrast.abs().max() == 4.0
+
+
+# Light in one pixel alone makes the largest contrast: details and lowpass are sums over pixels.
+@pytest.mark.parametrize("transform", [Haar(), StationaryHaar()], ids=str)
+@pytest.mark.parametrize(
+    "size", [(1, 4), (1, 5), (1, 37), (1, 64), (5, 7), (9, 9), (16, 16), (17, 33)], ids=str
+)
+def test_light_makes_no_contrast_over_eight_beside_black(
+    size: tuple[int, int], transform: Haar | StationaryHaar
+) -> None:
+    pixels = size[0] * size[1]
+    lights = torch.eye(pixels, dtype=torch.float64).view(pixels, 1, *size).expand(-1, 3, -1, -1)
+    cortex = transform.decompose(lights, true_means=True)
+    for level, details in enumerate(cortex.details):
+        adaptation = adapted(cortex.parent_lowpass(level), torch.full((3,), 1e-12)).reciprocal()
+        nodes = (details.shape[-2], details.shape[-1])
+        contrast = local_contrast(details, push(adaptation, nodes, before=cortex.before[level]))
+        assert contrast.abs().max() < 8.0 + 1e-9
 
 
 def test_grey_contrast_excites_all_three_channels() -> None:

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torch_vdm import VDM, Display, Haar, Observer, VDMLoss
+from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, VDMLoss
+from torch_vdm.model.cortex import Transform
 
 PPD = 64.0
 OBSERVERS = [Observer.paper(), Observer.calibrated()]
@@ -105,6 +106,26 @@ def test_the_border_of_an_odd_side_weighs_no_more(size: int, pixel: tuple[int, i
         # smaller.
         assert far <= 1.4 * expected_far
         assert (far == 0.0) == observer.charging
+
+
+# 0.01 cd/m2 on a black bar is next to nothing beside a lit wall, wherever the bar is.
+@pytest.mark.parametrize(
+    "transform",
+    [Haar(), Haar(csf="filter"), StationaryHaar(), StationaryHaar(csf="filter")],
+    ids=str,
+)
+@pytest.mark.parametrize("side", [64, 81])
+@pytest.mark.parametrize("rows", [1, 2, 3, 4, 5, 6, 8])
+def test_a_black_bar_is_no_lamp(transform: Transform, side: int, rows: int) -> None:
+    metric = VDM(PPD, Display.linear(100.0), transform=transform)
+    wall = 0.3 + 0.05 * random_images(1, 1, side, side)
+    for first in (0, side - rows, 29):
+        black = wall.clone()
+        black[..., first : first + rows, :] = 0.0
+        faint = black.clone()
+        faint[..., first : first + rows, :] = 1e-4
+        for turn in (black, faint), (black.mT, faint.mT):
+            assert metric.score(*turn) < 0.1
 
 
 @each_observer

@@ -187,11 +187,7 @@ def test_many_beside_one_are_compared_as_each_with_it(
     first, others = (
         metric.represent(image.double()) for image in (images(1, *size)[0], images(3, *size)[1])
     )
-    same = first._replace(
-        details=tuple(plane.expand(3, *plane.shape[1:]) for plane in first.details),
-        lowpass=tuple(plane.expand(3, *plane.shape[1:]) for plane in first.lowpass),
-        mean=first.mean.expand(3, -1, -1, -1),
-    )
+    same = first.each(lambda plane: plane.expand(3, *plane.shape[1:]))
     torch.testing.assert_close(charged.beside(first)(others), metric.compare(same, others))
     assert (charged.beside(first)(first) == 0.0).all()
 

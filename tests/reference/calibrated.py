@@ -228,10 +228,23 @@ def window(plane: Array, row: Row, parent: Row) -> Array:
     return np.stack(columns, axis=1)
 
 
-def cortex_filtering(sml: Array) -> Pyramid:
+@dataclass(frozen=True)
+class WindowedPyramid(Pyramid):
+    """A pyramid, and for each of its nodes the mean of what its details see.
+
+    Attributes
+    ----------
+    windows
+        The mean of the four columns and rows of every detail, each (3, h, w), cd/m2.
+    """
+
+    windows: tuple[Array, ...]
+
+
+def cortex_filtering(sml: Array) -> WindowedPyramid:
     """Eq. 2 from the pixels to the root, where every pixel has the same weight.
 
-    The lowpass of a node is the mean of the pixels that it has.
+    The lowpass of a node is the mean of the pixels that it has; that of its window is Eq. 2's.
 
     Parameters
     ----------
@@ -241,12 +254,12 @@ def cortex_filtering(sml: Array) -> Pyramid:
     grid = grid_of(*sml.shape[1:])
     lowpass = [sml]
     details: list[Array] = []
+    windows: list[Array] = []
     for (y_child, x_child), (y_row, x_row) in itertools.pairwise(grid):
-        step = []
-        for plane in lowpass[0]:
-            seen = window(window(plane.T, y_child, y_row).T, x_child, x_row)
-            step.append(haar_step(seen)[1])
-        details.insert(0, np.stack(step, axis=1))
+        seen = [window(window(plane.T, y_child, y_row).T, x_child, x_row) for plane in lowpass[0]]
+        step = [haar_step(plane) for plane in seen]
+        windows.insert(0, np.stack([mean for mean, _ in step]))
+        details.insert(0, np.stack([detail for _, detail in step], axis=1))
         means = np.zeros((3, y_row.nodes(), x_row.nodes()))
         for cone, y, x in np.ndindex(means.shape):
             rows, columns = y_row.pixels(y), x_row.pixels(x)
@@ -254,18 +267,19 @@ def cortex_filtering(sml: Array) -> Pyramid:
                 cone, rows.start : rows.stop, columns.start : columns.stop
             ].mean()
         lowpass.insert(0, means)
-    return Pyramid(tuple(lowpass), tuple(details))
+    return WindowedPyramid(tuple(lowpass), tuple(details), tuple(windows))
 
 
 # Local contrast
 
 
-def parent_lowpass(pyramid: Pyramid, level: int) -> Array:
+def parent_lowpass(pyramid: WindowedPyramid, level: int) -> Array:
     """Lowpass "one level up in the quad-tree" of every node of a level, (3, h, w), cd/m2.
 
-    The parent of a node has its pixels; the root, which has none, uses its own.
+    Of the parent's window. The parent of a node has its pixels; the root, which has none, uses its
+    own.
     """
-    own = pyramid.lowpass[level]
+    own = pyramid.windows[level]
     if level == 0:
         return own
     grid = grid_of(*pyramid.lowpass[-1].shape[1:])[::-1]
@@ -274,11 +288,11 @@ def parent_lowpass(pyramid: Pyramid, level: int) -> Array:
     for y in range(own.shape[1]):
         for x in range(own.shape[2]):
             above = y_up.at(y_row.pixels(y)[0]), x_up.at(x_row.pixels(x)[0])
-            parent[:, y, x] = pyramid.lowpass[level - 1][:, above[0], above[1]]
+            parent[:, y, x] = pyramid.windows[level - 1][:, above[0], above[1]]
     return parent
 
 
-def local_contrast(pyramid: Pyramid, level: int, dark_light: float) -> Array:
+def local_contrast(pyramid: WindowedPyramid, level: int, dark_light: float) -> Array:
     """Cone contrasts dS/S, dM/M, dL/L of one level (3, 3, h, w) over orientation and cone.
 
     Parameters
@@ -297,7 +311,7 @@ def local_contrast(pyramid: Pyramid, level: int, dark_light: float) -> Array:
 # CSF filtering
 
 
-def local_luminance(pyramid: Pyramid, level: int, dark_light: float) -> Array:
+def local_luminance(pyramid: WindowedPyramid, level: int, dark_light: float) -> Array:
     """Luminance to which every node is adapted, max(Y of the parent's lowpass, 0) + dark light.
 
     Y comes from S, M, L by the inverse of Eq. 1; the root uses its own lowpass.
@@ -634,7 +648,7 @@ def lowpass_term(
 
 def represent(
     xyz: Array, ppd: float, parameters: CalibratedParameters, effects: Effects = ALL_ON
-) -> Pyramid:
+) -> WindowedPyramid:
     """Cone fundamentals to chromatic aberration (Fig. 2) of one image (3, H, W), XYZ in cd/m2."""
     return chromatic_aberration(
         cortex_filtering(cone_fundamentals(xyz)),
@@ -646,7 +660,10 @@ def represent(
 
 
 def respond(
-    pyramid: Pyramid, ppd: float, parameters: CalibratedParameters, effects: Effects = ALL_ON
+    pyramid: WindowedPyramid,
+    ppd: float,
+    parameters: CalibratedParameters,
+    effects: Effects = ALL_ON,
 ) -> SignedResponses:
     """Local contrast to CSF filtering (Fig. 2) of one image's representation."""
     levels = len(pyramid.details)

@@ -12,9 +12,9 @@ level 0 has a single node.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,6 +127,9 @@ class Pyramid:
 
     lowpass: tuple[Array, ...]
     details: tuple[Array, ...]
+
+
+AnyPyramid = TypeVar("AnyPyramid", bound=Pyramid)
 
 
 @dataclass(frozen=True)
@@ -345,12 +348,12 @@ def aberration_factor(f: float, cutoff: float, exponent: float) -> float:
 
 
 def chromatic_aberration(
-    pyramid: Pyramid,
+    pyramid: AnyPyramid,
     ppd: float,
     effects: Effects,
     cutoff: float = ABERRATION_CUTOFF,
     exponent: float = ABERRATION_EXPONENT,
-) -> Pyramid:
+) -> AnyPyramid:
     """Fig. 4: attenuate the S details of every level; M, L and all lowpass stay.
 
     Parameters
@@ -371,7 +374,7 @@ def chromatic_aberration(
     for level, details in enumerate(pyramid.details):
         factor = aberration_factor(level_frequency(level, levels, ppd), cutoff, exponent)
         attenuated.append(details * np.array([factor, 1.0, 1.0])[None, :, None, None])
-    return Pyramid(pyramid.lowpass, tuple(attenuated))
+    return replace(pyramid, details=tuple(attenuated))
 
 
 # Local contrast

@@ -376,6 +376,12 @@ def weighted_levels(
         weighted = np.zeros(details.shape)
         for y, x in np.ndindex(details.shape[2:]):
             light = lowpass[:, y // 2, x // 2]
+            if kind == "stationary" and level + 1 < levels:
+                # A parent that had its nodes within would have a quarter of the light of each.
+                own = np.stack([cone[level][1] for cone in planes])
+                top, left = y // 2 * 2, x // 2 * 2
+                children = own[:, top : top + 2, left : left + 2]
+                light = np.maximum(light, children.max((1, 2)) / 4)
             luminance = max(float(sml_to_y @ light), 0.0) + parameters.dark_light
             contrast = details[:, :, y, x] / (np.maximum(light, 0.0) + dark)
             for orientation in range(len(details)):

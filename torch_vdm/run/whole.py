@@ -179,10 +179,8 @@ def _changes(model: Model, schedule: Schedule, first: Cortex, second: Cortex) ->
 
 def _halves(both: Cortex) -> Iterator[Cortex]:
     """Yield the representations of the first and of the second half of a batch."""
-    parts = [[plane.chunk(2) for plane in planes] for planes in (both.details, both.lowpass)]
-    for half, mean in enumerate(both.mean.chunk(2)):
-        details, lowpass = (tuple(plane[half] for plane in planes) for planes in parts)
-        yield both._replace(details=details, lowpass=lowpass, mean=mean)
+    for half in (0, 1):
+        yield both.each(lambda plane, half=half: plane.chunk(2)[half])
 
 
 def _few(schedule: Schedule, cortex: Cortex) -> int:

@@ -4,7 +4,9 @@ Where nodes do not begin or end with the image, the first and the last node of a
 pixels than the others, and may lack their sibling. A pair of siblings l and r along a side has a
 mean r + w (l - r) and a detail h (l - r), with w = h = 1/2 as in Eq. 2 between the borders. There:
 
-- the *lowpass* is the mean of the pixels that the pair has;
+- the *lowpass* is the mean of the pixels that the pair has; the eye is adapted to that of its
+  *window*, the nodes as the details take them: beside the lowpass alone a bright wall above a black
+  last row had a contrast without bound;
 - of the *details* a node that holds the share s of its pixels is weakened to n + s (m - n), m its
   mean and n that of the node beside it, as if the pixels that it lacks were like these. A node
   without sibling gets the node beside it for one, so that its details are those of a window over
@@ -128,10 +130,13 @@ def with_siblings(plane: Tensor, sides: tuple[Side, Side]) -> Tensor:
     return functional.pad(plane, (left, right, top, bottom), mode="reflect")
 
 
-def analyse_at_border(even: Tensor, down: Weights, across: Weights) -> tuple[Tensor, Tensor]:
-    """Return the lowpass (B, C, h, w) and the details (B, C, 3, h, w) of planes `with_siblings`.
+def analyse_at_border(
+    even: Tensor, down: Weights, across: Weights
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the lowpass, the details and the means of the windows of planes `with_siblings`.
 
-    ``down`` and ``across``: of the pairs along h and w.
+    (B, C, h, w), (B, C, 3, h, w) and (B, C, h, w). ``down`` and ``across``: of the pairs along h
+    and w.
     """
     left, right = even[..., 0::2], even[..., 1::2]
     between = left - right
@@ -144,8 +149,10 @@ def analyse_at_border(even: Tensor, down: Weights, across: Weights) -> tuple[Ten
     top, bottom = detail[..., 0::2, :], detail[..., 1::2, :]
     between = top - bottom
     horizontal, diagonal = torch.addcmul(bottom, down.completed, between), down.half * between
-    vertical = down.half * (mean[..., 0::2, :] - mean[..., 1::2, :])
-    return lowpass, torch.stack((horizontal, vertical, diagonal), 2)
+    bottom = mean[..., 1::2, :]
+    between = mean[..., 0::2, :] - bottom
+    window = torch.addcmul(bottom, down.completed, between)
+    return lowpass, torch.stack((horizontal, down.half * between, diagonal), 2), window
 
 
 def means_at_border(even: Tensor, down: Weights, across: Weights) -> tuple[Tensor]:

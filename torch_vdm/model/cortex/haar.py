@@ -122,7 +122,7 @@ class Haar:
         """Decompose the rest of an image; see `Transform.resume`."""
         # The first step is a level that tiles have.
         grid = self.grid(base.size, true_means)
-        _, (plane,) = levels(base.plane, base.octaves, base.size, steps, true_means, grid, 1)
+        _, (plane,), _ = levels(base.plane, base.octaves, base.size, steps, true_means, grid, 1)
         rest = base._replace(plane=plane, octaves=base.octaves + 1)
         return self.coarser(rest, steps, true_means)
 
@@ -142,9 +142,9 @@ class Haar:
         plane, octaves, size, mean = base
         if grid is None:
             grid = self.grid(size, true_means)
-        details, lowpass = levels(plane, octaves, size, steps, true_means, grid, count, items)
-        coarsest_first = tuple(reversed(details)), tuple(reversed(lowpass or [plane]))
-        return Cortex(*coarsest_first, mean, octaves, items, grid)
+        found = levels(plane, octaves, size, steps, true_means, grid, count, items)
+        details, lowpass, windows = (tuple(reversed(planes)) for planes in found)
+        return Cortex(details, lowpass or (plane,), mean, octaves, items, grid, windows or None)
 
     def peak(self, level_from_finest: int) -> tuple[float, float]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there."""
@@ -171,8 +171,8 @@ def levels(
     grid: Grid,
     count: int = DEEPEST,
     items: int = 1,
-) -> tuple[list[Tensor], list[Tensor]]:
-    """Return details and lowpass of the ``count`` finest levels, the finest first.
+) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+    """Return details, lowpass and windows of the ``count`` finest levels, the finest first.
 
     ``planes`` (B, C, h, w) are the means of nodes of 2^octaves pixels a side, which lie as ``grid``
     says, of an image of ``size`` = (H, W) pixels; or (1, C, items h, w) of ``items`` of them.
@@ -189,7 +189,9 @@ def levels(
         analyse_at_border,
         items,
     )
-    return [detail for _, detail in found], [lowpass for lowpass, _ in found]
+    # Inside an image a window is the node.
+    windows = [window[0] if window else lowpass for lowpass, _, *window in found]
+    return [detail for _, detail, *_ in found], [lowpass for lowpass, *_ in found], windows
 
 
 def lowpasses(

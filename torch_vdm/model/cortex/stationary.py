@@ -1,5 +1,6 @@
 """The Haar decomposition with shifts: nodes overlap, so that no place and no phase is preferred."""
 
+import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -153,7 +154,15 @@ class StationaryHaar:
             detail, *lowest = steps(analyse, faded, means)
             details.append(detail)
             lowpass += lowest
-        return Cortex(tuple(reversed(details)), tuple(reversed(lowpass)), mean, finest)
+        # A node may begin before its parent, where that is shifted. Had it been within, the parent
+        # would have at least a quarter of its light.
+        windows = [
+            torch.maximum(parent, 0.25 * functional.max_pool2d(nodes, 2, ceil_mode=True))
+            for nodes, parent in itertools.pairwise(lowpass)
+        ]
+        of_levels = (reversed(planes) for planes in (details, lowpass, lowpass[:1] + windows))
+        details_of, lowpass_of, windows_of = map(tuple, of_levels)
+        return Cortex(details_of, lowpass_of, mean, finest, windows=windows_of or None)
 
 
 def _faded(parts: Tensor, sides: tuple[Side, Side]) -> Tensor:

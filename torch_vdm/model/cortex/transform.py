@@ -1,5 +1,6 @@
 """What every cortex transform is held to."""
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
 
 from torch import Tensor
@@ -42,6 +43,9 @@ class Cortex(NamedTuple):
         How many images lie below one another in every plane; where there are several, B is 1.
     grid
         Where the nodes lie on the image.
+    windows
+        One tensor a level, (B, cones, h, w): the means of all that the nodes' details are made of,
+        to which the eye is adapted one level down. None where this is their lowpass.
     """
 
     details: tuple[Tensor, ...]
@@ -50,6 +54,7 @@ class Cortex(NamedTuple):
     finest: int = 0
     items: int = 1
     grid: Grid = PAPERS
+    windows: tuple[Tensor, ...] | None = None
 
     @property
     def before(self) -> tuple[Before, ...]:
@@ -57,8 +62,22 @@ class Cortex(NamedTuple):
         return self.grid.down(len(self.details), self.finest)
 
     def parent_lowpass(self, level: int) -> Tensor:
-        """Return the lowpass one level up from ``level``; the root's is its own."""
-        return self.lowpass[max(level - 1, 0)]
+        """Return the lowpass one level up from ``level``, of windows; the root's is its own."""
+        return (self.windows or self.lowpass)[max(level - 1, 0)]
+
+    def each(self, function: Callable[..., Tensor], *others: "Cortex") -> "Cortex":
+        """Return the representation with every plane as a function makes it, of the others' too."""
+        all_of = (self, *others)
+
+        def of_levels(*planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+            return tuple(function(*level) for level in zip(*planes, strict=True))
+
+        return self._replace(
+            details=of_levels(*(one.details for one in all_of)),
+            lowpass=of_levels(*(one.lowpass for one in all_of)),
+            mean=function(*(one.mean for one in all_of)),
+            windows=self.windows and of_levels(*(one.windows or one.lowpass for one in all_of)),
+        )
 
 
 class Base(NamedTuple):
