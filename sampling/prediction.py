@@ -27,7 +27,7 @@ from torch_vdm.model.matrix import mix
 # Images that are simulated for one prediction: as many as have `SIMULATED` pixels together. The
 # maximum of a small image scatters more (10 to 20 % at 32x32, 5 % at 128x128), so that more are
 # needed to know its mean and deviation to 2 % and 10 %. Status: choice, measured.
-FEWEST_DRAWS, MOST_DRAWS, SIMULATED = 16, 64, 2**20
+FEWEST_DRAWS, MOST_DRAWS, SIMULATED = 16, 64, 2**18
 
 # The predicted maximum lies this many standard deviations over the mean of the simulated ones;
 # their own variance, and that of the prediction's error, as a share of the mean, are added. The
@@ -151,12 +151,25 @@ class Model:
     def errors(self) -> LocalErrors:
         """The local errors of the boundary images for any number of samples."""
         with torch.no_grad():
-            return LocalErrors(self.metric, self.truth, self.leaves())
+            return LocalErrors(self.metric, self.lit(self.truth), self.leaves())
 
     @cached_property
     def textured(self) -> Cortex:
         """The image as textured as it may be; `truth` is the one as plain as it may be."""
         return self._estimated(_textured)
+
+    def lit(self, truth: Cortex) -> Cortex:
+        """Return an image to whose noise the eye is adapted as to its light, in the mean square.
+
+        What boundary images and simulated ones are compared at. On black the former have no light
+        to be adapted to, so that the eye would be blind to their noise; the latter have any, next
+        to none in places, so that it would see all of it.
+        """
+        lit = tuple(
+            torch.hypot(window, variance.mean(2).sqrt().to(window))
+            for window, variance in zip(truth.windows or (), self.details, strict=True)
+        )
+        return truth._replace(windows=lit or None)
 
     def _estimated(self, estimate: Callable[[Tensor, Tensor], Tensor]) -> Cortex:
         """Return the image with its details as estimated from them and their variances."""
@@ -168,10 +181,10 @@ class Model:
     def shares(self) -> NDArray[np.float64]:
         """Return what share of the samples each pixel should have, (H, W), not negative.
 
-        How much its noise adds to the largest totals: the mean of what `_slopes` finds from the
-        image as plain and as textured as it may be. `EVEN` of all is shared by all that are noisy.
+        How much its noise adds to the largest totals: the mean of what that is of the image as
+        plain and as textured as it may be. `EVEN` of all is shared by all that are noisy.
         """
-        found = 0.5 * (self._slopes(self.truth) + self._slopes(self.textured))
+        found = self._slopes(self.lit(self.truth), self.lit(self.textured))
         noisy = torch.from_numpy(self.noisy.astype(np.float64))[None, None]
         # And near there: not only where they were lucky.
         even = functional.max_pool2d(noisy, 2 * SURROUNDINGS + 1, 1, SURROUNDINGS)[0, 0]
@@ -179,20 +192,21 @@ class Model:
         shares: NDArray[np.float64] = ((1.0 - EVEN) * found + EVEN * even).numpy()
         return shares
 
-    def _slopes(self, truth: Cortex) -> Tensor:
+    def _slopes(self, *truths: Cortex) -> Tensor:
         """Return minus the derivative of a sum of the totals, to the power of `SHARPNESS`.
 
-        By the logarithm of each pixel's samples, (H, W), in units of the whole, not negative. In
-        single precision.
+        By the logarithm of each pixel's samples, (H, W), in units of the whole, not negative; the
+        mean over the images. In single precision.
         """
-        logarithm = torch.zeros(self.size, dtype=torch.float32, requires_grad=True)
-        truth = truth.each(Tensor.float)
-        totals = self._totals(self.variance.float() * torch.exp(-logarithm), truth)
-        largest = totals.detach().amax().clamp_min(1e-300)
+        batch = truths[0].each(lambda *planes: torch.cat(planes).float(), *truths[1:])
+        logarithm = torch.zeros(len(truths), 1, *self.size, requires_grad=True)
+        totals = self._totals(self.variance.float() * torch.exp(-logarithm), batch)
+        largest = totals.detach().amax((1, 2, 3), keepdim=True).clamp_min(1e-300)
         power = SHARPNESS / self.exponent
         (gradient,) = torch.autograd.grad(((totals / largest) ** power).sum(), logarithm)
         slopes = gradient.double().neg().clamp_min(0.0)
-        return slopes / slopes.sum().clamp_min(1e-300)
+        slopes = slopes / slopes.sum((1, 2, 3), keepdim=True).clamp_min(1e-300)
+        return slopes.mean((0, 1))
 
     def _totals(self, variance: Tensor, truth: Cortex) -> Tensor:
         self._look()
@@ -210,7 +224,8 @@ class Model:
         """Return the largest difference in each of ``draws`` simulated pairs of images, JND.
 
         The details of the truth are taken as the current ones, shrunk by the share of noise in them
-        and among their neighbours; noise with the estimated covariance makes the image from them.
+        and among their neighbours; noise with the estimated covariance makes the image from them,
+        which the eye sees adapted to both alike.
         In single precision, for differences are known to some percent. A quarter of them, on the
         plain image, correct the boundary images; see `_correct`.
 
@@ -282,11 +297,12 @@ class Model:
 
     def _judge(self, truth: Cortex) -> Callable[[Cortex], Tensor]:
         """Return what finds the totals, (B, 1, h, w), that noises add to an image."""
-        first = truth.each(Tensor.float)
+        first = self.lit(truth).each(Tensor.float)
         compare = self.metric.beside(first)
 
         def seen(noise: Cortex) -> Tensor:
-            return compare(first.each(torch.add, noise)).double()
+            second = first.each(torch.add, noise)
+            return compare(second._replace(windows=first.windows)).double()
 
         return seen
 

@@ -1,6 +1,7 @@
 """Where test data lives, what images tests are made of, and the reference's observer."""
 
 import dataclasses
+import signal
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,9 @@ from torch_vdm.model.cortex import Transform
 
 settings.register_profile("default", deadline=None, derandomize=True, max_examples=40)
 settings.load_profile("default")
+
+# A shell lets what it starts in the background ignore Ctrl-C, and so would the commands under test.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The images of tests are small: threads would wait for each other longer than they compute.
 torch.set_num_threads(1)

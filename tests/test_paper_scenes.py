@@ -85,9 +85,9 @@ def test_the_chromatic_scenes_colours_have_one_luminance() -> None:
     assert luminances[1] == pytest.approx(luminances[0], rel=1e-3)
 
 
-def counted(name: str, strategy: str, spp: float) -> Plane:
+def counted(name: str, strategy: str, spp: float, seed: int = 3) -> Plane:
     """Return samples of every pixel once a small run has taken so many a pixel, (H, W)."""
-    renderer = MitsubaRenderer(SCENES / f"{name}.xml", SMALL, seed=3)
+    renderer = MitsubaRenderer(SCENES / f"{name}.xml", SMALL, seed=seed)
     metric = VDM(60.0, Display.linear(100.0), Observer.paper())
     # From a pilot that has seen the light from everywhere.
     settings = Settings(strategy=strategy, tolerance=3.0, pilot=64)  # type: ignore[arg-type]
@@ -101,14 +101,16 @@ def counted(name: str, strategy: str, spp: float) -> Plane:
 def test_objective_samples_the_sphere_where_it_is_bright_perceptual_evenly() -> None:
     light = draw(SCENES / "contrast.xml", AIMED, 64)[..., 0].mean(1).reshape(SIDE, SIDE)[inside()]
     bright, dark = light > np.quantile(light, 0.9), light < np.quantile(light, 0.1)
-    for strategy in ("objective", "perceptual"):
-        count = counted("contrast", strategy, 300.0)[inside()]
-        found = count[bright].mean() / count[dark].mean()
-        if strategy == "objective":
-            # Its samples go by the variance, which goes by the square of the light.
-            assert found > 0.7 * (light[bright].mean() / light[dark].mean()) ** 2
-        else:
-            assert 0.75 < found < 1.33
+
+    def brighter(strategy: str, seed: int) -> float:
+        count = counted("contrast", strategy, 300.0, seed)[inside()]
+        return float(count[bright].mean() / count[dark].mean())
+
+    # Its samples go by the variance, which goes by the square of the light.
+    square = (light[bright].mean() / light[dark].mean()) ** 2
+    assert brighter("objective", 3) > 0.7 * square
+    # 0.95 to 1.6 from run to run.
+    assert 0.75 < np.mean([brighter("perceptual", seed) for seed in range(1, 9)]) < 1.33
 
 
 def test_perceptual_samples_the_plain_rectangle_more_than_the_carpet() -> None:
