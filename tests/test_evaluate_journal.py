@@ -58,6 +58,16 @@ def test_no_journal_is_an_empty_one(tmp_path: Path) -> None:
     assert read(tmp_path) == {}
 
 
+def test_two_at_once_are_refused(tmp_path: Path) -> None:
+    with Journal(tmp_path) as lines:
+        lines.add(result("1", 0.5))
+        with pytest.raises(ImageError, match="no other evaluation at work there"):
+            Journal(tmp_path)
+        lines.add(result("2", 0.5))
+    assert len(read(tmp_path)) == 2
+
+
 def test_a_folder_that_takes_no_file_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
     with pytest.raises(ImageError, match="cannot be written"):
-        Journal(tmp_path / "none")
+        Journal(tmp_path / "file")

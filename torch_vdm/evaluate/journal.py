@@ -9,9 +9,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from filelock import FileLock, Timeout
+
 from torch_vdm.io import ImageError
 
-NAME = "journal.jsonl"
+NAME, LOCK = "journal.jsonl", "journal.lock"
 
 # What a line has beside a result: CRC-32 of the rest as JSON. A disk may change a digit, and the
 # line would still be read.
@@ -79,12 +81,28 @@ class Journal(Mapping[tuple[str, str], Result]):
 
     It has the last result of each frame and test, and takes more. A torn last line, and one that
     was damaged or that another version wrote, count for nothing. Of a result only its place in the
-    file is held in memory.
+    file is held in memory. While one is open no other can be: two would each have only their own.
+
+    Raises
+    ------
+    ImageError
+        Where it cannot be written, or another is open.
     """
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / NAME
         self._places: dict[tuple[str, str], int] = {}
+        # The system frees it however the process ends.
+        self._lock = FileLock(folder / LOCK)
+        try:
+            self._lock.acquire(blocking=False)
+        except Timeout:
+            raise ImageError(
+                f"{folder}: expected no other evaluation at work there, got one; wait for its end, "
+                "or name another folder"
+            ) from None
+        except OSError as error:
+            raise ImageError(f"{folder}: cannot be written: {error.strerror or error}") from error
         try:
             _drop_torn_line(self._path)
             self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
@@ -113,6 +131,7 @@ class Journal(Mapping[tuple[str, str], Result]):
         """Close the file."""
         os.close(self._file)
         self._lines.close()
+        self._lock.release()
 
     def __getitem__(self, key: tuple[str, str]) -> Result:
         """Return the last result of a frame and a test."""
