@@ -285,19 +285,24 @@ class VDM(PairMetric):
     def beside(self, first: Cortex) -> Callable[[Cortex], Tensor]:
         """Return `compare` with a first representation that stays, whose responses are taken once.
 
-        It may stand for a batch of others, (1, ...) beside (B, ...), but not for images below one
+        Nor is the eye's adaptation found anew for one that has the windows of the first. It may
+        stand for a batch of others, (1, ...) beside (B, ...), but not for images below one
         another. Nearly half of the time where many are compared with one; in the last bits other
         numbers than `compare`. Coarse differences are charged to all pixels below them: where the
         largest of the map is wanted, of noise that is everywhere, it is the same.
         """
-        responses = self.respond(first)
+        model = self.model(first.mean.dtype)
+        sights = model.adaptation(first)
+        responses = model.responses(first, sights)
 
         def compare(second: Cortex) -> Tensor:
             model = self.model(second.mean.dtype)
             options = model.options()
+            same = first.windows is not None and second.windows is first.windows
+            others = model.responses(second, sights if same else None)
             local = tuple(
                 gathered(difference_of(own, seen, options), options)
-                for own, seen in zip(responses, model.responses(second), strict=True)
+                for own, seen in zip(responses, others, strict=True)
             )
             return accumulate(local, model.root(first, second), before=first.before)
 

@@ -152,18 +152,26 @@ class Model:
         local = self.observer.adaptation_luminance is None
         return filtering.weights(self.constants, passed, bright, local, self.effects.chromatic)
 
-    def responses(self, cortex: Cortex) -> tuple[Tensor, ...]:
+    def responses(
+        self, cortex: Cortex, sights: Sequence[Sight] | None = None
+    ) -> tuple[Tensor, ...]:
         """Return the responses of one image, one (B, channels, orientations, h, w) a level.
 
-        From chromatic aberration to the transducer; level 0 first, 1 is threshold.
+        From chromatic aberration to the transducer; level 0 first, 1 is threshold. ``sights``:
+        its `adaptation`, where that is known.
         """
+        options = self.options()
+        seen_at = zip(cortex.details, sights or self.adaptation(cortex), strict=True)
+        return tuple(response(detail, sight, options) for detail, sight in seen_at)
+
+    def adaptation(self, cortex: Cortex) -> list[Sight]:
+        """Return the sight of each level of one image, at its nodes."""
         levels = self.levels(cortex.finest, len(cortex.details))
         found = []
         for number, detail in enumerate(cortex.details):
             (sight,) = self.sights(levels.only(number), [cortex], number)
-            pushed = sight.pushed(_size(detail), before=cortex.before[number])
-            found.append(response(detail, pushed, self.options()))
-        return tuple(found)
+            found.append(sight.pushed(_size(detail), before=cortex.before[number]))
+        return found
 
     # Of two.
 
