@@ -16,6 +16,7 @@ BENCHMARKS = {
     "20 minutes, 30 seconds with --quick",
     "evaluate": "what many frames cost beside the metric, and what they hold; 20 minutes, "
     "1 with --quick",
+    "gpu": "time, memory and equality on a CUDA device; 10 minutes, 15 seconds with --quick",
     "large": "memory on images up to 16,384 x 16,384; 15 minutes, 15 seconds with --quick",
     "launches": "how many operations a map is, which a GPU waits for; 1 minute, 5 seconds with "
     "--quick",
