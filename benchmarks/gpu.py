@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from benchmarks import peers
+from benchmarks.launches import step
 from benchmarks.people import RUNGS
 from benchmarks.record import blank_figure, caption, circumstances, save
 from benchmarks.scenes import STILL_LIFE, scene_file, sized
@@ -33,6 +34,9 @@ from torch_vdm import VDM, VDMLoss
 
 SIZES = ((256, 256), (512, 512), FULL_HD, (2160, 3840))
 QUICK_SIZES = ((176, 192),)
+
+# Nothing is read back, which a graph cannot, and nothing left out.
+OPTIONS: dict[str, Any] = {"nonfinite": "mask", "effects": "full"}
 
 # What is replayed from a CUDA graph too.
 CAPTURED = (*RUNGS, "VDMLoss")
@@ -106,10 +110,9 @@ def _maps(device: torch.device, quick: bool, missing: dict[str, str]) -> dict[st
         except (ImportError, OSError) as error:
             missing[name] = f"not there: {error}"
     for name, transform in RUNGS.items():
-        # Nothing is read back, which a graph cannot.
-        found[name] = VDM(transform=transform, nonfinite="mask", effects="full").to(device)
+        found[name] = VDM(transform=transform, **OPTIONS).to(device)
     if not quick:  # a smoke test would compile for half a minute
-        found["fast, compiled"] = VDM(nonfinite="mask", effects="full").to(device).compile()
+        found["fast, compiled"] = VDM(**OPTIONS).to(device).compile()
     return found
 
 
@@ -117,16 +120,12 @@ def _steps(device: torch.device, quick: bool) -> dict[str, Function]:
     """Return losses with their gradients."""
     losses: dict[str, Function] = {
         "kornia SSIM loss": kornia_ssim_loss(),
-        "VDMLoss": VDMLoss(nonfinite="mask", effects="full").to(device),
+        "VDMLoss": VDMLoss(**OPTIONS).to(device),
     }
     if not quick:
-        fast = VDMLoss(nonfinite="mask", effects="full").to(device).compile()
+        fast = VDMLoss(**OPTIONS).to(device).compile()
         losses["VDMLoss, compiled"] = fast
-    return {name: partial(_step, loss) for name, loss in losses.items()}
-
-
-def _step(loss: Function, test: Tensor, reference: Tensor) -> None:
-    loss(test.detach().requires_grad_(), reference).backward()
+    return {name: step(loss) for name, loss in losses.items()}
 
 
 def _lpips(device: torch.device) -> Function:
@@ -239,7 +238,7 @@ def _peak(device: torch.device) -> Iterator[list[float]]:
 def _equality(name: str, device: torch.device, size: tuple[int, int]) -> float:
     """Return the largest difference between this device's map and the processor's, as a share."""
     pair = images(size)
-    metric = VDM(transform=RUNGS[name], nonfinite="mask", effects="full")
+    metric = VDM(transform=RUNGS[name], **OPTIONS)
     with torch.no_grad():
         expected = metric(*pair)
         found = metric.to(device)(*(image.to(device) for image in pair)).cpu()
@@ -250,7 +249,7 @@ def _waits(name: str, device: torch.device) -> bool:
     """Return whether a map makes the processor wait for the device."""
     if device.type != "cuda":
         return False
-    metric = VDM(transform=RUNGS[name], nonfinite="mask", effects="full").to(device)
+    metric = VDM(transform=RUNGS[name], **OPTIONS).to(device)
     pair = [image.to(device) for image in images((128, 128))]
     with torch.no_grad():
         metric(*pair)

@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from benchmarks.people import RUNGS
 from benchmarks.record import caption, circumstances, save
-from benchmarks.speed import BATCH, FULL_HD, PATCH
+from benchmarks.speed import BATCH, FULL_HD, PATCH, ssim, ssim_loss
 from torch_vdm import VDM, VDMLoss
 from torch_vdm.run.schedule import Job, Schedule, chosen
 
@@ -49,8 +49,8 @@ def run(quick: bool, output: Path | None) -> None:
     size, patch = ((64, 96), (32, 32)) if quick else (FULL_HD, PATCH)
     pair, batch = torch.rand(2, 1, 3, *size), torch.rand(2, BATCH, 3, *patch)
     result: dict[str, Any] = {**circumstances(), "size": size, "batch": [BATCH, *patch]}
-    maps: dict[str, Contender] = {"kornia SSIM": _ssim()}
-    losses: dict[str, Contender] = {"kornia SSIM": _ssim_loss()}
+    maps: dict[str, Contender] = {"kornia SSIM": ssim()}
+    losses: dict[str, Contender] = {"kornia SSIM": ssim_loss()}
     for name, transform in rungs.items():
         # Read back once an image, where asked for, and no kernel of the map's.
         options: dict[str, Any] = {"transform": transform, "nonfinite": "mask", "effects": "full"}
@@ -60,7 +60,7 @@ def run(quick: bool, output: Path | None) -> None:
         losses[f"{name}, a processor's"] = VDMLoss(**options)
     with torch.no_grad():
         result["map"] = {name: count(function, *pair) for name, function in maps.items()}
-    result["loss"] = {name: count(_step(loss), *batch) for name, loss in losses.items()}
+    result["loss"] = {name: count(step(loss), *batch) for name, loss in losses.items()}
     result["wanted"] = WANTED
     table = _table(result)
     print(table)
@@ -92,23 +92,13 @@ def _of_a_gpu(gradients: bool) -> Schedule:
     )
 
 
-def _step(loss: Contender) -> Contender:
-    def step(test: Tensor, reference: Tensor) -> None:
+def step(loss: Contender) -> Contender:
+    """Return what computes a loss and its gradient."""
+
+    def forward_and_backward(test: Tensor, reference: Tensor) -> None:
         loss(test.detach().requires_grad_(), reference).backward()
 
-    return step
-
-
-def _ssim() -> Contender:
-    from kornia.metrics import ssim
-
-    return lambda test, reference: ssim(test, reference, 11)
-
-
-def _ssim_loss() -> Contender:
-    from kornia.losses import SSIMLoss
-
-    return SSIMLoss(11)
+    return forward_and_backward
 
 
 def _table(result: dict[str, Any]) -> str:

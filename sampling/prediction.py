@@ -26,7 +26,7 @@ from torch_vdm.model.matrix import mix
 
 # Images that are simulated for one prediction: as many as have `SIMULATED` pixels together. The
 # maximum of a small image scatters more (10 to 20 % at 32x32, 5 % at 128x128), so that more are
-# needed to know its mean and deviation to 2 % and 10 %. Status: choice, measured.
+# needed to know its mean to 2 %. Status: choice, measured.
 FEWEST_DRAWS, MOST_DRAWS, SIMULATED = 16, 64, 2**18
 
 # The predicted maximum lies this many standard deviations over the mean of the simulated ones;
@@ -96,8 +96,6 @@ class Model:
         self.mean = torch.from_numpy(statistics.mean.reshape(1, 3, *size))
         self.true_means = metric.observer.true_means
         self.exponent = metric.observer.summation_exponent
-        with torch.no_grad():
-            self.cortex = metric.represent(self.mean)
         self.to_cones = _to_cones(metric)
         # Of a single sample, and of the mean of them.
         self.single_variance = self._cone_variance()
@@ -106,6 +104,8 @@ class Model:
         self.correction: Tensor | None = None
         # Of the details, which are estimated from them in single precision.
         self.details = detail_variances(self.variance.float(), self.true_means)
+        with torch.no_grad():
+            self.cortex = self._lit(metric.represent(self.mean))
         self.truth = self._estimated(partial(_shrunk, doubt=PLACING_DOUBT))
 
     def totals(self, count: NDArray[np.float64] | None = None) -> Tensor:
@@ -151,15 +151,15 @@ class Model:
     def errors(self) -> LocalErrors:
         """The local errors of the boundary images for any number of samples."""
         with torch.no_grad():
-            return LocalErrors(self.metric, self.lit(self.truth), self.leaves())
+            return LocalErrors(self.metric, self.truth, self.leaves())
 
     @cached_property
     def textured(self) -> Cortex:
         """The image as textured as it may be; `truth` is the one as plain as it may be."""
         return self._estimated(_textured)
 
-    def lit(self, truth: Cortex) -> Cortex:
-        """Return an image to whose noise the eye is adapted as to its light, in the mean square.
+    def _lit(self, cortex: Cortex) -> Cortex:
+        """Return the image to whose noise the eye is adapted as to its light, in the mean square.
 
         What boundary images and simulated ones are compared at. On black the former have no light
         to be adapted to, so that the eye would be blind to their noise; the latter have any, next
@@ -167,9 +167,9 @@ class Model:
         """
         lit = tuple(
             torch.hypot(window, variance.mean(2).sqrt().to(window))
-            for window, variance in zip(truth.windows or (), self.details, strict=True)
+            for window, variance in zip(cortex.windows or (), self.details, strict=True)
         )
-        return truth._replace(windows=lit or None)
+        return cortex._replace(windows=lit or None)
 
     def _estimated(self, estimate: Callable[[Tensor, Tensor], Tensor]) -> Cortex:
         """Return the image with its details as estimated from them and their variances."""
@@ -184,7 +184,7 @@ class Model:
         How much its noise adds to the largest totals: the mean of what that is of the image as
         plain and as textured as it may be. `EVEN` of all is shared by all that are noisy.
         """
-        found = self._slopes(self.lit(self.truth), self.lit(self.textured))
+        found = self._slopes(self.truth, self.textured)
         noisy = torch.from_numpy(self.noisy.astype(np.float64))[None, None]
         # And near there: not only where they were lucky.
         even = functional.max_pool2d(noisy, 2 * SURROUNDINGS + 1, 1, SURROUNDINGS)[0, 0]
@@ -297,12 +297,12 @@ class Model:
 
     def _judge(self, truth: Cortex) -> Callable[[Cortex], Tensor]:
         """Return what finds the totals, (B, 1, h, w), that noises add to an image."""
-        first = self.lit(truth).each(Tensor.float)
+        first = truth.each(Tensor.float)
         compare = self.metric.beside(first)
 
         def seen(noise: Cortex) -> Tensor:
-            second = first.each(torch.add, noise)
-            return compare(second._replace(windows=first.windows)).double()
+            details = tuple(map(torch.add, first.details, noise.details))
+            return compare(first._replace(details=details, mean=first.mean + noise.mean)).double()
 
         return seen
 

@@ -81,7 +81,7 @@ def test_pieces_are_the_metric_in_one_piece(observer: Observer, size: tuple[int,
     with torch.no_grad():
         variance = model.single_variance / torch.from_numpy(count)
         variances = detail_variances(variance, model.true_means)
-        expected = local_errors(model.metric, model.lit(model.truth), variances, variance)
+        expected = local_errors(model.metric, model.truth, variances, variance)
         found = model.errors.at(model.leaves(count))
     for one, other in zip(found, expected, strict=True):
         scale = float(other.max())

@@ -96,17 +96,14 @@ class Journal(Mapping[tuple[str, str], Result]):
         self._lock = FileLock(folder / LOCK)
         try:
             self._lock.acquire(blocking=False)
+            _drop_torn_line(self._path)
+            self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+            self._lines = self._path.open("rb")
         except Timeout:
             raise ImageError(
                 f"{folder}: expected no other evaluation at work there, got one; wait for its end, "
                 "or name another folder"
             ) from None
-        except OSError as error:
-            raise ImageError(f"{folder}: cannot be written: {error.strerror or error}") from error
-        try:
-            _drop_torn_line(self._path)
-            self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-            self._lines = self._path.open("rb")
         except OSError as error:
             raise ImageError(
                 f"{self._path}: cannot be written: {error.strerror or error}"

@@ -36,7 +36,7 @@ def local_contrast(details: Tensor, scale: Tensor) -> Tensor:
         (B, 3, orientations, h, w); cones S, M, L.
     scale
         (B, 3, h, w): one over what `adapted` gives for the parent of each node. Not for the
-        nodes themselves: a contrast is at most 4 for light that is not negative.
+        nodes themselves: for light that is not negative a contrast is at most 4, at a border 7.
 
     Returns
     -------

@@ -160,8 +160,8 @@ class StationaryHaar:
             torch.maximum(parent, 0.25 * functional.max_pool2d(nodes, 2, ceil_mode=True))
             for nodes, parent in itertools.pairwise(lowpass)
         ]
-        of_levels = (reversed(planes) for planes in (details, lowpass, lowpass[:1] + windows))
-        details_of, lowpass_of, windows_of = map(tuple, of_levels)
+        found = details, lowpass, lowpass[:1] + windows
+        details_of, lowpass_of, windows_of = (tuple(reversed(planes)) for planes in found)
         return Cortex(details_of, lowpass_of, mean, finest, windows=windows_of or None)
 
 
