@@ -1,12 +1,14 @@
 """``torch-vdm evaluate`` as a user runs it: folders in, a folder with results out."""
 
 import csv
+import hashlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -19,6 +21,7 @@ from torch_vdm.cli import main
 from torch_vdm.evaluate import journal, judge
 
 FRAMES = 8
+D3 = Path(str(files("torch_vdm.evaluate") / "web" / "d3.min.js"))
 
 
 @pytest.fixture
@@ -257,7 +260,7 @@ def test_a_manifest_and_files_of_any_kind(folders: Path) -> None:
     assert told["frame"] == "</script>"
     assert told["figures"]["max_jnd"] > 1.0
     page = (folders / "out/report.html").read_text()
-    assert page.count("</script>") == 2
+    assert page.count("</script>") == 3
 
 
 def test_names_are_text_in_the_page(folders: Path) -> None:
@@ -267,7 +270,15 @@ def test_names_are_text_in_the_page(folders: Path) -> None:
     page = (folders / "out/report.html").read_text()
     assert "<i>" not in page
     assert "<title>Visible differences: &lt;i&gt;&amp;amp;</title>" in page
-    assert "http" not in page.replace("http://www.w3.org/2000/svg", "")
+    # D3 has the names of its site and of namespaces in it; the page asks for neither.
+    assert "http" not in page.replace(D3.read_text(), "")
+
+
+def test_the_library_in_the_page_is_the_one_that_was_released() -> None:
+    """The file of the npm package d3 7.9.0, byte for byte, with its licence beside it."""
+    released = "f2094bbf6141b359722c4fe454eb6c4b0f0e42cc10cc7af921fc158fceb86539"
+    assert hashlib.sha256(D3.read_bytes()).hexdigest() == released
+    assert "Mike Bostock" in D3.with_name("d3.LICENSE").read_text()
 
 
 def test_parquet_holds_the_table(folders: Path) -> None:

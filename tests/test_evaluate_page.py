@@ -96,7 +96,7 @@ def open_frame(page: Any, number: int) -> None:
 def _helpers(page: Any) -> None:
     # The last drawing that was asked for is on the canvas.
     page.execute_script(
-        "window.painted = () => Number(canvas.dataset.asked) === Number(canvas.dataset.painted)"
+        "window.painted = () => $('panes').dataset.asked === $('panes').dataset.painted"
     )
 
 
@@ -104,11 +104,17 @@ def press(page: Any, keys: str) -> None:
     page.find_element("tag name", "body").send_keys(keys)
 
 
+def middle(page: Any) -> list[float]:
+    """Return what pixel of the picture lies in the middle of a pane, x and y."""
+    half = "[panes()[0].clientWidth / 2, panes()[0].clientHeight / 2]"
+    return list(value(page, f"view.transform.invert({half})"))
+
+
 def point(page: Any, x: int, y: int) -> str:
     """Move the pointer to a place of the canvas, from its left top, and return what is told."""
     from selenium.webdriver import ActionChains
 
-    canvas = page.find_element("id", "canvas")
+    canvas = page.find_element("css selector", "#panes canvas")
     width, height = canvas.size["width"], canvas.size["height"]
     ActionChains(page, duration=0).move_to_element_with_offset(
         canvas, x - width // 2, y - height // 2
@@ -137,7 +143,7 @@ def test_the_table_sorts_and_filters(page: Any) -> None:
 
 def test_what_is_said_is_text(page: Any) -> None:
     assert value(page, "document.querySelectorAll('h6').length") == 0
-    assert value(page, "document.querySelectorAll('body > script').length") == 2
+    assert value(page, "document.querySelectorAll('body > script').length") == 3
     assert NAMES[1] in value(page, "$('verdicts').textContent")
     assert EVIL in value(page, "$('frames').textContent")
     assert value(page, "$('skipped').querySelectorAll('tr').length") == 1
@@ -148,10 +154,10 @@ def test_a_click_on_a_worst_region_goes_there(page: Any) -> None:
     page.find_element("css selector", "#worst a").click()
     wait(page, "view.row && painted()")
     assert value(page, "!$('frame').hidden && $('summary').hidden")
-    row = value(page, "[view.row.peak, view.x, view.y, view.row.regions[0]]")
-    left, top, width, height, jnd = row[3]
-    assert (row[1], row[2]) == (left + width / 2, top + height / 2)
-    assert left <= row[0][0] < left + width
+    peak, region = value(page, "[view.row.peak, view.row.regions[0]]")
+    left, top, width, height, jnd = region
+    assert middle(page) == pytest.approx([left + width / 2, top + height / 2])
+    assert left <= peak[0] < left + width
     assert jnd == value(page, "Number(maximum(view.row).toFixed(2))")
 
 
@@ -168,7 +174,7 @@ def test_the_value_under_the_pointer_is_the_maps(page: Any, report: Path) -> Non
             x, y = int(found[1]), int(found[2])
             assert float(found[3]) == pytest.approx(jnd[y, x].item(), abs=0.00501)
             # The picture is as large as fits, in the middle.
-            width, height = value(page, "[canvas.width, canvas.height]")
+            width, height = value(page, "[panes()[0].width, panes()[0].height]")
             scale = min(width / WIDTH, height / HEIGHT)
             assert x == pytest.approx(WIDTH / 2 + (place[0] - width / 2) / scale, abs=1.2)
             assert y == pytest.approx(HEIGHT / 2 + (place[1] - height / 2) / scale, abs=1.2)
@@ -179,32 +185,55 @@ def test_the_value_under_the_pointer_is_the_maps(page: Any, report: Path) -> Non
 def test_zoom_keeps_what_is_under_the_pointer(page: Any) -> None:
     open_frame(page, 0)
     before = point(page, 200, 150)
-    scale = value(page, "view.scale")
+    scale = value(page, "view.transform.k")
     page.execute_script(
-        """const box = canvas.getBoundingClientRect();
-        canvas.dispatchEvent(new WheelEvent("wheel", {deltaY: -600, clientX: box.left + 200,
+        """const box = panes()[0].getBoundingClientRect();
+        panes()[0].dispatchEvent(new WheelEvent("wheel", {deltaY: -600, clientX: box.left + 200,
           clientY: box.top + 150, cancelable: true}))"""
     )
     wait(page, "painted()")
-    assert value(page, "view.scale") == pytest.approx(4.0 * scale)
+    # As d3-zoom has it: 500 pixels of the wheel double the size.
+    assert value(page, "view.transform.k") == pytest.approx(2.0**1.2 * scale)
     assert point(page, 200, 150) == before
     page.find_element("id", "fit").click()
-    assert value(page, "view.scale") == pytest.approx(scale)
+    assert value(page, "view.transform.k") == pytest.approx(scale)
     # Dragging moves all layers at once.
-    from selenium.webdriver import ActionChains
 
     press(page, "+")
     wait(page, "painted()")
-    x = value(page, "view.x")
-    canvas = page.find_element("id", "canvas")
+    x = middle(page)[0]
+    drag(page, 0, -200)
+    assert middle(page)[0] < x
+
+
+def drag(page: Any, number: int, x: int) -> None:
+    """Drag a pane by 60 pixels to the right, from a place beside its middle."""
+    from selenium.webdriver import ActionChains
+
+    canvas = page.find_elements("css selector", "#panes canvas")[number]
     ActionChains(page, duration=0).move_to_element_with_offset(
-        canvas, -200, 0
+        canvas, x, 0
     ).click_and_hold().move_by_offset(60, 0).release().perform()
-    assert value(page, "view.x") < x
+
+
+def test_panes_move_together(page: Any) -> None:
+    open_frame(page, 0)
+    press(page, "v")
+    wait(page, "panes().length === 3 && painted()")
+    press(page, "++")
+    wait(page, "painted()")
+    before, scale = middle(page), value(page, "view.transform.k")
+    drag(page, 2, -20)
+    wait(page, "painted()")
+    assert middle(page) == pytest.approx([before[0] - 60.0 / scale, before[1]])
+    kept = value(page, "panes().map((pane) => d3.zoomTransform(pane).x)")
+    assert len(set(kept)) == 1
+    press(page, "v")
 
 
 def colour(page: Any, x: int, y: int) -> list[int]:
-    return list(value(page, f"[...context.getImageData({x}, {y}, 1, 1).data].slice(0, 3)"))
+    data = f"panes()[0].getContext('2d').getImageData({x}, {y}, 1, 1).data"
+    return list(value(page, f"[...{data}].slice(0, 3)"))
 
 
 def test_the_slider_shows_one_or_the_other(page: Any) -> None:
@@ -219,18 +248,23 @@ def test_the_slider_shows_one_or_the_other(page: Any) -> None:
     press(page, "]]]]")  # 0.2 of the width
     wait(page, "painted()")
     assert colour(page, 100, 200) == reference
-    assert colour(page, int(value(page, "canvas.width")) - 100, 200) != reference
+    assert colour(page, int(value(page, "panes()[0].width")) - 100, 200) != reference
     press(page, "m")
     wait(page, "painted()")
     assert value(page, "$('right').value") == "test"
-    assert "left and A right" in value(page, "canvas.getAttribute('aria-label')")
+    assert "left and A right" in value(page, "panes()[0].getAttribute('aria-label')")
+    # The line between them is dragged.
+    drag(page, 0, int(value(page, "panes()[0].clientWidth * (view.slider - 0.5)")))
+    moved = 0.2 + 60.0 / value(page, "panes()[0].clientWidth")
+    assert value(page, "view.slider") == pytest.approx(moved, abs=0.002)
 
 
 def test_exposure_shows_what_is_over_white(page: Any) -> None:
     open_frame(page, 0)
     page.execute_script("setSlider(1)")
     wait(page, "painted()")
-    place = "[...Array(90).keys()].map((x) => context.getImageData(x * 10, 60, 1, 1).data[0])"
+    data = "panes()[0].getContext('2d').getImageData(x * 10, 60, 1, 1).data[0]"
+    place = f"[...Array(90).keys()].map((x) => {data})"
     assert 255 in value(page, place)
     page.execute_script("$('exposure').value = -4; $('exposure').dispatchEvent(new Event('input'))")
     wait(page, "painted()")
@@ -254,10 +288,10 @@ def test_keys_do_everything(page: Any) -> None:
     assert value(page, "panes().length") == 3
     press(page, "v+")
     wait(page, "painted()")
-    x = value(page, "view.x")
-    page.find_element("id", "canvas").send_keys("\ue014")  # the arrow to the right
+    x = middle(page)[0]
+    page.find_element("id", "panes").send_keys("\ue014")  # the arrow to the right
     wait(page, "painted()")
-    assert value(page, "view.x") > x
+    assert middle(page)[0] > x
     press(page, "?")
     assert value(page, "$('help').open")
     press(page, "\ue00c")  # Esc closes the keys, and then leaves the frame
@@ -285,7 +319,7 @@ def test_a_narrow_screen_scrolls_in_one_direction(page: Any) -> None:
         assert value(page, "document.documentElement.scrollWidth") <= 390
         open_frame(page, 0)
         assert value(page, "document.documentElement.scrollWidth") <= 390
-        assert value(page, "canvas.width") == pytest.approx(2 * 370, abs=30)
+        assert value(page, "panes()[0].width") == pytest.approx(2 * 370, abs=30)
     finally:
         page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 

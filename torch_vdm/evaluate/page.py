@@ -16,6 +16,10 @@ from torch_vdm.evaluate.overview import Overview
 from torch_vdm.io import atomic_path
 from torch_vdm.report import SMALLEST_SCALE
 
+# The page's own scripts, in the order in which they build on one another. Plots, zoom and the rows
+# of tables are D3's, which lies beside them.
+SCRIPTS = ("data.js", "summary.js", "pictures.js", "frame.js", "controls.js")
+
 
 def write(
     path: Path,
@@ -59,10 +63,10 @@ def write(
     }
     rows = (_row(result, tests, names) for result in results if not result.skipped)
     skipped = ([r.frame, r.test, r.skipped] for r in results if r.skipped)
-    package = files("torch_vdm.evaluate")
+    web = files("torch_vdm.evaluate") / "web"
     parts: dict[str, Iterable[str]] = {
         "title": [html.escape("Visible differences: " + ", ".join(tests))],
-        "style": [(package / "page.css").read_text("utf-8")],
+        "style": [(web / "page.css").read_text("utf-8")],
         "data": chain(
             [_in_script(data)[:-1], ',"rows":['],
             _listed(rows),
@@ -70,9 +74,10 @@ def write(
             _listed(skipped),
             ["]}"],
         ),
-        "script": [(package / "page.js").read_text("utf-8")],
+        "library": [(web / "d3.min.js").read_text("utf-8")],
+        "script": ((web / name).read_text("utf-8") for name in SCRIPTS),
     }
-    text = (package / "page.html").read_text("utf-8")
+    text = (web / "page.html").read_text("utf-8")
     with (
         atomic_path(path) as temporary,
         temporary.open("w", encoding="utf-8", errors="backslashreplace") as file,

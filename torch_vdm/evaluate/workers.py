@@ -81,7 +81,6 @@ def results(
                 yield answer
     finally:
         for connection, hand in hands.items():
-            hand.process.terminate()
             _end(connection, hand)
 
 
@@ -106,8 +105,9 @@ def _give(connection: Connection, job: Job, known: Known) -> None:
 
 
 def _end(connection: Connection, hand: _Hand) -> None:
-    """Let a process end and forget it."""
+    """End a process, whose work is done, and forget it: by itself it would take half a second."""
     connection.close()
+    hand.process.terminate()
     hand.process.join()
     hand.process.close()
 
