@@ -26,10 +26,10 @@ from benchmarks.calibrate import HIGHEST_CONTRAST, MECHANISMS, by_mechanism, cen
 from benchmarks.daly import PSYCHOMETRIC, detection_probability
 from benchmarks.peers import Peer, clipped, installed
 from benchmarks.pictures import distorted, photographs
+from benchmarks.rungs import RUNGS
 from benchmarks.speed import images, peak_megabytes
 from benchmarks.thresholds import Threshold, pattern, read_thresholds, render, sampling
 from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar
-from torch_vdm.cli import TRANSFORMS
 from torch_vdm.model.cortex import Transform
 
 Array = NDArray[np.float64]
@@ -66,7 +66,6 @@ PAPERS_RATIO = 60.0
 # Contenders that take no more seconds are timed in so many times as many rounds. Status: choice.
 QUICK_SECONDS, QUICK_ROUNDS = 1.0, 4
 
-RUNGS: dict[str, Transform] = {name: make() for name, make in TRANSFORMS.items()}
 HALFWAY: dict[str, Transform] = {
     "Haar, CSF before": Haar("filter"),
     "StationaryHaar": StationaryHaar(),

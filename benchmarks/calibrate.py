@@ -7,6 +7,9 @@ number of its level, its channel and its luminance alone times the coefficient a
 map is largest stand for the stimulus, so that a fit takes seconds. The zones of a rendered picture
 in which people could not see its noise any more are fitted too, by the whole metric. What comes out
 is judged by `VDM.score` itself, on the stimuli as light.
+
+A rung could also be held to what `reference` says of pictures. What that would gain, and cost of
+people's thresholds, is measured for the two rungs below it, and not used.
 """
 
 import dataclasses
@@ -15,6 +18,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import chain
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,8 +30,10 @@ from torch import Tensor, nn
 from torch.func import functional_call, jacfwd
 from torch.nn import functional
 
-from benchmarks import people, record
+from benchmarks import pictures, record
 from benchmarks.people import DECIBELS, PPD, PPDS, zone_scores, zones
+from benchmarks.pictures import Pair
+from benchmarks.rungs import ALL, RUNGS
 from benchmarks.thresholds import (
     Threshold,
     background,
@@ -36,7 +42,7 @@ from benchmarks.thresholds import (
     render,
     sampling,
 )
-from torch_vdm import VDM, Display, Effects, Haar, Observer, StationaryHaar
+from torch_vdm import VDM, Display, Effects, Observer
 from torch_vdm.model.cortex import Cortex, Transform, bands
 from torch_vdm.model.filtering import band_contrast, band_sensitivity
 from torch_vdm.model.masking import unmasked
@@ -44,13 +50,6 @@ from torch_vdm.model.pooling import covering, phase_energy, pool_halves, surroun
 from torch_vdm.model.quadtree import push
 
 MECHANISMS = ("achromatic", "red-green", "yellow-violet", "mixed")
-
-# The rungs that are fitted, by the name that tables give them.
-RUNGS: dict[str, Transform] = {
-    **people.RUNGS,
-    "stationary": StationaryHaar(),
-    "filtered": Haar("filter"),
-}
 
 # Pixels in a cycle (its upper end) and phase of the drawings of each stimulus. Status: choice: a
 # user's display samples a cycle in any way.
@@ -91,7 +90,12 @@ MIXED_WEIGHT, OUTLIER, SPREAD = 0.3, 8.0, 3.0
 # gratings and noise what no observer of these parameters has of both.
 ANCHOR, NOISE = 90.0, 300.0
 
-# The step of a parameter's logarithm for the slopes of the noise.
+# Where a rung is held to `reference`: how strongly all pictures together are, against one row; of
+# how many photographs the distortions are fitted, and the share of the renders. The others judge.
+# Status: choice.
+LIKENESS, FITTED_PHOTOS, FITTED_RENDERS = 2000.0, 2, 2.0 / 3.0
+
+# The step of a parameter's logarithm for the slopes of what the whole metric says.
 STEP = 0.1
 
 # Evaluations of a fit that begins near where it ends.
@@ -425,13 +429,13 @@ def robust(residual: Tensor) -> Tensor:
     return residual * torch.sqrt(2.0 / (1.0 + torch.sqrt(1.0 + (residual / OUTLIER) ** 2)))
 
 
-# The mean of the noise of a picture by logarithms of the parameters, dB over what people just see.
-Noise = Callable[[Array], float]
+# What the whole metric says of pictures, by logarithms of the parameters: weighted residuals in dB.
+Seen = Callable[[Array], Array]
 
 
-def _no_noise(logs: Array) -> float:
+def _nothing_seen(logs: Array) -> Array:
     del logs
-    return 0.0
+    return np.zeros(0)
 
 
 def fit(
@@ -439,11 +443,12 @@ def fit(
     start: dict[str, float],
     evaluations: int = 25,
     spread: float = SPREAD,
-    noise: Noise = _no_noise,
+    seen: Seen = _nothing_seen,
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return the fitted parameters and the standard deviation of their logarithms.
 
-    ``spread`` is the rms of the data in dB: how much the beliefs of `FREE` weigh against it.
+    ``spread`` is the rms of the data in dB: how much the beliefs of `FREE` weigh against it. What
+    is ``seen`` of pictures is fitted beside the thresholds.
     """
     from scipy.optimize import least_squares
 
@@ -472,11 +477,11 @@ def fit(
 
     def evaluate(logs: Array) -> Array:
         with torch.no_grad():
-            return np.append(terms(torch.tensor(logs)), noise(logs) * NOISE**0.5)
+            return np.append(terms(torch.tensor(logs)), seen(logs))
 
     def slopes(logs: Array) -> Array:
         rows = jacfwd(terms)(torch.tensor(logs)).detach()
-        return np.vstack((rows, _tangent(noise, logs)[1] * NOISE**0.5))
+        return np.vstack((rows, _slopes(seen, logs)))
 
     begin = np.log([start[name] for name in names])
     found = least_squares(evaluate, begin, jac=slopes, max_nfev=evaluations, xtol=1e-4, ftol=1e-5)
@@ -485,25 +490,40 @@ def fit(
     return values, dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
 
 
-def _tangent(noise: Noise, about: Array) -> tuple[float, Array]:
-    """Return a noise at some parameters, and its slopes by their logarithms."""
-    seen = noise(about)
-    rises = [noise(about + step) - seen for step in STEP * np.eye(len(about))]
-    return seen, np.array(rises) / STEP
+def _slopes(seen: Seen, about: Array) -> Array:
+    """Return the slopes of what is seen by the parameters' logarithms."""
+    here = seen(about)
+    rises = [seen(about + step) - here for step in STEP * np.eye(len(about))]
+    return np.stack(rises, 1) / STEP
 
 
-def noise_of(observer: Observer, transform: Transform, every: int = ZONES) -> Noise:
-    """Return the `Noise` of SIN3D's zones; of none where the data is not there."""
+def noise_of(observer: Observer, transform: Transform, every: int = ZONES) -> Seen:
+    """Return what is seen of the noise in SIN3D's zones: its mean; nothing without the data."""
     some = zones()[::every]
     if not some:
-        return _no_noise
+        return _nothing_seen
 
-    def noise(logs: Array) -> float:
-        changed: Any = dict(zip(FREE, np.exp(logs).tolist(), strict=True))
-        scores = zone_scores(dataclasses.replace(observer, **changed), transform, PPD, some)
-        return float(np.mean(DECIBELS * np.log(scores)))
+    def noise(logs: Array) -> Array:
+        scores = zone_scores(_changed(observer, logs), transform, PPD, some)
+        return np.array([NOISE**0.5 * np.mean(DECIBELS * np.log(scores))])
 
     return noise
+
+
+def likeness_of(observer: Observer, transform: Transform, some: list[Pair], aim: Array) -> Seen:
+    """Return what is seen of pairs, over what `reference` sees: its largest values, ``aim``."""
+
+    def likeness(logs: Array) -> Array:
+        found = pictures.largest(_changed(observer, logs), transform, some)
+        weighted: Array = (LIKENESS / len(some)) ** 0.5 * DECIBELS * np.log(found / aim)
+        return weighted
+
+    return likeness
+
+
+def _changed(observer: Observer, logs: Array) -> Observer:
+    values: Any = dict(zip(FREE, np.exp(logs).tolist(), strict=True))
+    return dataclasses.replace(observer, **values)
 
 
 def predicted(model: Model | FormulaModel, values: dict[str, float]) -> Array:
@@ -531,18 +551,18 @@ def left_out(
     thresholds: list[Threshold],
     folds: NDArray[np.int64],
     start: dict[str, float],
-    noise: Noise = _no_noise,
+    seen: Seen = _nothing_seen,
 ) -> dict[str, float]:
     """Return the rms of rows that the fit did not see, one gain a study and mechanism."""
     residual = np.full(len(thresholds), np.nan)
     for fold in sorted(set(folds.tolist()) - {-1}):
         inside = [t for t, f in zip(thresholds, folds, strict=True) if f != fold]
         outside = [t for t, f in zip(thresholds, folds, strict=True) if f == fold]
-        values, _ = fit(make(inside), start, IN_FOLDS, noise=noise)
+        values, _ = fit(make(inside), start, IN_FOLDS, seen=seen)
         residual[folds == fold] = predicted(make(outside), values)
-    seen = folds >= 0
-    some = [t for t, s in zip(thresholds, seen, strict=True) if s]
-    return by_mechanism(centred(residual[seen], some), some)
+    left = folds >= 0
+    some = [t for t, one in zip(thresholds, left, strict=True) if one]
+    return by_mechanism(centred(residual[left], some), some)
 
 
 def whole_metric(
@@ -634,7 +654,7 @@ def calibrate(quick: bool) -> Iterator[dict[str, Any]]:
         "noise_is_fitted": bool(zones()) and not quick,
         "rungs": {},
     }
-    rungs = {n: t for n, t in RUNGS.items() if not quick or n in ("fast", "standard")}
+    rungs = {n: t for n, t in ALL.items() if not quick or n in ("fast", "standard")}
     with ProcessPoolExecutor(initializer=_alone, mp_context=get_context("spawn")) as pool:
         # The slowest, which are the last, first.
         jobs = {
@@ -643,6 +663,13 @@ def calibrate(quick: bool) -> Iterator[dict[str, Any]]:
         for job in as_completed(jobs):
             done = found["rungs"] | {jobs[job]: job.result()}
             found["rungs"] = {name: done[name] for name in rungs if name in done}
+            yield found
+    if not quick and pictures.photographs(1):
+        aims = beside_reference()
+        for name in ("fast", "standard"):
+            found["rungs"][name]["held_to_reference"] = held(
+                RUNGS[name], used, found["rungs"][name], *aims
+            )
             yield found
     if not quick:
         # The curves alone, of the rung that has the paper's transform.
@@ -676,9 +703,9 @@ def rung(
     def drawn(some: list[Threshold]) -> Model:
         return Model(observer, some, DRAWINGS[:1], transform)
 
-    noise = _no_noise if quick else noise_of(observer, transform)
+    noise = _nothing_seen if quick else noise_of(observer, transform)
     model = Model(observer, used, drawings, transform)
-    values, deviations = fit(model, start, 6 if quick else 30, noise=noise)
+    values, deviations = fit(model, start, 6 if quick else 30, seen=noise)
     residual = predicted(model, values)
     discs_residual = predicted(Model(observer, discs, drawings, transform), values)
     numbers: dict[str, Any] = {**values}
@@ -697,7 +724,7 @@ def rung(
     }
     if not quick:
         noise = noise_of(observer, transform, ZONES * ZONES)
-        one, _ = fit(drawn(used), values, IN_FOLDS, noise=noise)
+        one, _ = fit(drawn(used), values, IN_FOLDS, seen=noise)
         result["one_drawing"] = by_mechanism(centred(predicted(drawn(used), one), used), used)
         folds = five_folds(used), studies(used)
         result["five_folds"] = left_out(drawn, used, folds[0], values, noise)
@@ -712,6 +739,70 @@ def rung(
     whole = whole_metric(fitted, some, residual[::every], *DRAWINGS[0], transform=transform)
     result["whole_metric"] = by_mechanism(centred(whole, some), some)
     return result
+
+
+class _Beside(NamedTuple):
+    """Pairs, and the largest value of each map of `reference`, JND."""
+
+    pairs: list[Pair]
+    aim: Array
+
+
+def beside_reference() -> tuple[_Beside, _Beside]:
+    """Return the pairs that are fitted, and those that judge."""
+    generator = torch.Generator().manual_seed(1)
+    photos = [
+        [Pair(kind, test, photo) for kind, test in pictures.distorted(photo, generator).items()]
+        for photo in pictures.photographs(5).values()
+    ]
+    renders = list(pictures.renders())
+    cut = round(FITTED_RENDERS * len(renders))
+    sides = (
+        [*chain(*photos[:FITTED_PHOTOS]), *renders[:cut]],
+        [*chain(*photos[FITTED_PHOTOS:]), *renders[cut:]],
+    )
+    fitted, judging = (
+        _Beside(some, pictures.largest(None, RUNGS[pictures.JUDGE], some)) for some in sides
+    )
+    return fitted, judging
+
+
+def held(
+    transform: Transform,
+    used: list[Threshold],
+    alone: dict[str, Any],
+    fitted: _Beside,
+    judging: _Beside,
+) -> dict[str, Any]:
+    """Return what a rung gains and loses when it is held to `reference` on pictures too.
+
+    ``alone``: what `rung` found without.
+    """
+    observer = Observer.calibrated().fitted_to(transform)
+    model = Model(observer, used, DRAWINGS[:1], transform)
+    start = {name: alone["parameters"][name]["value"] for name in FREE}
+    noise = noise_of(observer, transform, ZONES * ZONES)
+    likeness = likeness_of(observer, transform, *fitted)
+    values, _ = fit(
+        model, start, IN_FOLDS, seen=lambda logs: np.append(noise(logs), likeness(logs))
+    )
+    told = {}
+    for name, parameters in (("alone", start), ("held", values)):
+        residual = predicted(model, parameters)
+        logs = np.log([parameters[each] for each in FREE])
+        changed = _changed(observer, logs)
+        octaves = [
+            np.log2(pictures.largest(changed, transform, side.pairs) / side.aim)
+            for side in (fitted, judging)
+        ]
+        told[name] = {
+            "thresholds": by_mechanism(centred(residual, used), used),
+            "without_gains_together": float(np.sqrt(np.mean(residual**2))),
+            "pictures_octaves": [float(np.sqrt(np.mean(each**2))) for each in octaves],
+            "zones": zone_scores(changed, transform, PPD, zones()).tolist(),
+            "parameters": parameters,
+        }
+    return told
 
 
 def study_gains(residual: Array, thresholds: list[Threshold]) -> dict[str, float]:
@@ -754,7 +845,7 @@ def table(result: dict[str, Any]) -> str:
         lines += [_row(name, title, found[key]) for key, title in ROWS.items() if key in found]
     lines += [_row("", t, result[key]) for key, t in FORMULA_ROWS.items() if key in result]
     for name, found in result["rungs"].items():
-        lines += ["", f"## {name}: `{RUNGS[name]!r}`", "", *_of_rung(found)]
+        lines += ["", f"## {name}: `{ALL[name]!r}`", "", *_of_rung(found)]
     return "\n".join(lines) + "\n"
 
 
@@ -792,9 +883,32 @@ def _of_rung(found: dict[str, Any]) -> list[str]:
             lines.append(
                 f"| {float(ppd):.0f} | {2.0 ** octaves.mean():.2f} | {octaves.std():.2f} |"
             )
+    if "held_to_reference" in found:
+        lines += _of_held(found["held_to_reference"])
     lines += ["", "| parameter | value | within a factor of |", "|---|---|---|"]
     lines += [
         f"| {name} | {of['value']:.4g} | {of['times_or_over']:.2f} |"
         for name, of in found["parameters"].items()
     ]
+    return lines
+
+
+def _of_held(found: dict[str, Any]) -> list[str]:
+    """Return the table of what holding a rung to `reference` would do."""
+    lines = [
+        "",
+        "If it were held to `reference` on pictures too (not used):",
+        "",
+        "| | " + " | ".join(MECHANISMS) + " | without gains, together | largest values over "
+        "`reference`'s, pictures of the fit, octaves rms | other pictures | SIN3D's zones, JND |",
+        "|---|" + "---|" * (len(MECHANISMS) + 4),
+    ]
+    for name, of in found.items():
+        thresholds = " | ".join(f"{of['thresholds'][m]:.2f}" for m in MECHANISMS)
+        inside, outside = of["pictures_octaves"]
+        octaves = np.log2(of["zones"])
+        lines.append(
+            f"| {name} | {thresholds} | {of['without_gains_together']:.2f} | {inside:.2f} "
+            f"| {outside:.2f} | {2.0 ** octaves.mean():.2f} ± {octaves.std():.2f} octaves |"
+        )
     return lines

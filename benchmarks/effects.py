@@ -153,6 +153,32 @@ def run_metric(quick: bool, output: Path | None) -> None:
     if output is not None:
         record.save(output, "effects", result, text)
         plot(result, output / "effects.png")
+        draw_way(pairs(size)["local edits"], output / "effects_plan.png")
+
+
+def draw_way(pair: Pair, path: Path) -> None:
+    """Draw one pair's way through its plan: the two images, what the plan keeps, the map."""
+    metric = VDM()
+    plan = metric.plan(*pair)
+    squares = plan.differing[0]
+    assert squares is not None
+    with torch.no_grad():
+        jnd = metric(*pair)[0, 0]
+    figure = record.blank_figure(9.0, 5.6)
+    (one, other), (kept, mapped) = figure.subplots(2, 2)
+    for axes, image, title in ((one, pair.reference, "reference"), (other, pair.test, "test")):
+        axes.imshow(image[0].permute(1, 2, 0).numpy())
+        axes.set_title(title, fontsize=10)
+    kept.imshow(squares.numpy(), cmap="gray", interpolation="nearest")
+    share = float(squares.float().mean())
+    kept.set_title(f"plan: squares of {plan.square} pixels that differ, {share:.1%}", fontsize=10)
+    drawn_map = mapped.imshow(jnd.numpy(), cmap="inferno")
+    mapped.set_title(f"map: 0 in {(jnd == 0.0).float().mean():.0%} of the pixels", fontsize=10)
+    figure.colorbar(drawn_map, ax=mapped, label="JND")
+    for axes in (one, other, kept, mapped):
+        axes.set_xticks([])
+        axes.set_yticks([])
+    figure.savefig(path)
 
 
 def table(result: dict[str, Any]) -> str:

@@ -22,8 +22,8 @@ from torch import Tensor
 
 from benchmarks import peers
 from benchmarks.launches import step
-from benchmarks.people import RUNGS
 from benchmarks.record import blank_figure, caption, circumstances, save
+from benchmarks.rungs import RUNGS
 from benchmarks.scenes import STILL_LIFE, scene_file, sized
 from benchmarks.speed import BATCH, FULL_HD, PATCH, images
 from benchmarks.speed import ssim as kornia_ssim

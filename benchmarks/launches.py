@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from benchmarks.people import RUNGS
 from benchmarks.record import caption, circumstances, save
+from benchmarks.rungs import RUNGS
 from benchmarks.speed import BATCH, FULL_HD, PATCH, ssim, ssim_loss
 from torch_vdm import VDM, VDMLoss
 from torch_vdm.run.schedule import Job, Schedule, chosen

@@ -15,8 +15,9 @@ from torch import Tensor
 
 from benchmarks import record
 from benchmarks.places import shared_data
+from benchmarks.rungs import RUNGS
 from benchmarks.thresholds import D65
-from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, read_image
+from torch_vdm import VDM, Display, Observer, read_image
 from torch_vdm.model.cortex import Transform
 
 Array = NDArray[np.float64]
@@ -50,13 +51,6 @@ PITCH, DISTANCE = 0.1845, 600.0
 
 # Levels of the wavelet transform that those thresholds were measured with; the side of a picture.
 OCTAVES, PICTURE = 5, 256
-
-# The rungs that are judged.
-RUNGS: dict[str, Transform] = {
-    "fast": Haar(),
-    "standard": StationaryHaar("filter"),
-    "reference": Steerable(),
-}
 
 DECIBELS = 20.0 / math.log(10.0)
 

@@ -13,14 +13,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
 from benchmarks import record
-from benchmarks.calibrate import RUNGS
 from benchmarks.places import shared_data
-from torch_vdm import VDM, Display, read_image
+from benchmarks.rungs import ALL
+from torch_vdm import VDM, Display, Observer, read_image
+from torch_vdm.model.cortex import Transform
 from torch_vdm.model.display import decode_srgb, encode_srgb
+
+Array = NDArray[np.float64]
 
 # The side of a picture in pixels, and its first row and column in a photograph.
 SIDE, CORNER = 256, 100
@@ -31,8 +35,8 @@ SIDE, CORNER = 256, 100
 # 5 JND.
 NOISE, WAVE, GRAIN, RESIDUE, PATCH, BANDS, CAST = 0.02, 0.02, 0.15, 0.015, 8, 40.0, 0.03
 
-# Beside what the others are held.
-JUDGE = "reference"
+# Beside what the others are held; the pixels per degree of all pictures.
+JUDGE, PPD = "reference", 60.0
 
 
 class Pair(NamedTuple):
@@ -47,11 +51,12 @@ def distorted(photo: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
     """Return what a picture (1, 3, H, W), sRGB-coded, is like after each distortion."""
     height, width = photo.shape[-2:]
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    noise = torch.randn(photo.shape, generator=generator)
-    box = torch.full((3, 1, 3, 3), 1.0 / 9.0)
+    noise = torch.randn(photo.shape, generator=generator, dtype=photo.dtype)
+    box = torch.full((3, 1, 3, 3), 1.0 / 9.0, dtype=photo.dtype)
     blurred = functional.conv2d(functional.pad(photo, (1,) * 4, "replicate"), box, groups=3)
-    normal = torch.randn(photo[:, :1].shape, generator=generator)
-    patches = torch.randn(1, 3, -(-height // PATCH), -(-width // PATCH), generator=generator)
+    normal = torch.randn(photo[:, :1].shape, generator=generator, dtype=photo.dtype)
+    size = -(-height // PATCH), -(-width // PATCH)
+    patches = torch.randn(1, 3, *size, generator=generator, dtype=photo.dtype)
     residue = functional.interpolate(patches, scale_factor=PATCH, mode="bilinear")
     cast = torch.tensor([1.0 + CAST, 1.0, 1.0 - CAST]).view(1, 3, 1, 1)
     sparse = functional.interpolate(photo[..., ::2, ::2], scale_factor=2.0, mode="nearest")
@@ -69,7 +74,7 @@ def distorted(photo: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
         "shift": photo.roll(1, -1),
         "grating": photo + WAVE * torch.sin(2.0 * math.pi * (x / 8.0 + y / 19.0)),
     }
-    return {kind: test.clamp(0.0, 1.0) for kind, test in tests.items()}
+    return {kind: test.to(photo.dtype).clamp(0.0, 1.0) for kind, test in tests.items()}
 
 
 def grainy(photo: Tensor, normal: Tensor) -> Tensor:
@@ -120,12 +125,19 @@ def pairs(quick: bool) -> Iterator[Pair]:
         yield from renders()
 
 
+def largest(observer: Observer | None, transform: Transform, some: list[Pair]) -> Array:
+    """Return the largest value of every pair's map, JND."""
+    metric = VDM(PPD, Display.srgb(), observer, transform)
+    with torch.no_grad():
+        return np.array([metric.score(pair.test, pair.reference).item() for pair in some])
+
+
 def run(quick: bool, output: Path | None) -> None:
     if not photographs(1):
         print(f"skipped: there is no {shared_data() / 'ldr'}; TORCH_VDM_DATA names the folder")
         return
-    rungs = {n: t for n, t in RUNGS.items() if not quick or n in ("fast", JUDGE)}
-    metrics = {name: VDM(60.0, Display.srgb(), transform=t) for name, t in rungs.items()}
+    rungs = {n: t for n, t in ALL.items() if not quick or n in ("fast", JUDGE)}
+    metrics = {name: VDM(PPD, Display.srgb(), transform=t) for name, t in rungs.items()}
     rows: list[dict[str, Any]] = []
     with torch.no_grad():
         for kind, test, reference in pairs(quick):

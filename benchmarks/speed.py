@@ -1,8 +1,10 @@
 """Time and memory of the metric beside kornia's SSIM, in one run.
 
 Times are medians of interleaved runs: every round runs each contender once, so that whatever else
-the machine does strikes all of them. Memory and compile times are those of child processes, which
-begin with nothing. Two threads, sRGB noise in [0, 1], float32.
+the machine does strikes all of them. Each is in a process of its own, as its users have it, for the
+first metric of this package has the C library keep freed memory (`torch_vdm.run.memory`), which
+serves whatever else the process does: SSIM is also measured so. Memory and compile times are those
+of child processes, which begin with nothing. Two threads, sRGB noise in [0, 1], float32.
 """
 
 import ctypes
@@ -13,7 +15,10 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +27,7 @@ from torch import Tensor
 
 from benchmarks.record import blank_figure, caption, circumstances, measured_apart, save
 from torch_vdm import VDM, VDMLoss
+from torch_vdm.run.memory import keep_freed_memory
 
 THREADS = 2
 FULL_HD = (1080, 1920)
@@ -45,6 +51,12 @@ def ssim() -> Contender:
     return lambda test, reference: ssim(test, reference, 11)
 
 
+def ssim_kept() -> Contender:
+    """Kornia's SSIM where freed memory is kept."""
+    keep_freed_memory()
+    return ssim()
+
+
 def eager() -> Contender:
     """The default metric."""
     return VDM()
@@ -66,6 +78,12 @@ def ssim_loss() -> Contender:
 
     loss = SSIMLoss(11)
     return lambda test, reference: loss(test, reference)
+
+
+def ssim_loss_kept() -> Contender:
+    """Kornia's SSIM loss where freed memory is kept."""
+    keep_freed_memory()
+    return ssim_loss()
 
 
 def eager_loss() -> Contender:
@@ -110,9 +128,16 @@ def pytorch_msssim() -> Contender:
     return lambda test, reference: 1.0 - ssim(test, reference, data_range=1.0)
 
 
-FORWARD = {"kornia SSIM": ssim, "VDM": eager, "VDM compiled": compiled, "VDM paper": paper}
+FORWARD = {
+    "kornia SSIM": ssim,
+    "kornia SSIM, memory kept": ssim_kept,
+    "VDM": eager,
+    "VDM compiled": compiled,
+    "VDM paper": paper,
+}
 BACKWARD = {
     "kornia SSIM loss": ssim_loss,
+    "kornia SSIM loss, memory kept": ssim_loss_kept,
     "VDMLoss": eager_loss,
     "VDMLoss checkpoint": checkpointed_loss,
     "VDMLoss compiled": compiled_loss,
@@ -127,6 +152,9 @@ PEERS = {
 CONTENDERS = FORWARD | BACKWARD
 COMPILED = ("VDM compiled", "VDMLoss compiled")
 
+# What a smoke test takes.
+QUICK_FORWARD, QUICK_BACKWARD = ("kornia SSIM", "VDM"), ("kornia SSIM loss", "VDMLoss")
+
 
 def run(quick: bool, output: Path | None) -> None:
     """Measure, print the table, and write speed.json, speed.md and speed.png to ``output``."""
@@ -135,16 +163,16 @@ def run(quick: bool, output: Path | None) -> None:
     size = sizes[-1] if quick else FULL_HD
     rounds = 2 if quick else 9
     result: dict[str, Any] = {**circumstances(), "size": size, "rounds": rounds}
-    result["forward_seconds"] = _interleaved(FORWARD, size, rounds)
-    result["backward_seconds"] = _interleaved(BACKWARD, size, rounds)
-    installed = {name: maker for name, maker in PEERS.items() if _installed(maker)}
+    forward, backward = (QUICK_FORWARD, QUICK_BACKWARD) if quick else (FORWARD, BACKWARD)
+    result["forward_seconds"] = _interleaved(list(forward), size, rounds)
+    result["backward_seconds"] = _interleaved(list(backward), size, rounds)
+    installed = [name for name, maker in PEERS.items() if _installed(maker)]
     result["missing"] = [name for name in PEERS if name not in installed]
     batch = (BATCH, *(QUICK_SIZES[0] if quick else PATCH))
     result["batch"] = batch
-    result["batch_seconds"] = _interleaved(BACKWARD | installed, batch[1:], rounds, BATCH)
+    result["batch_seconds"] = _interleaved([*backward, *installed], batch[1:], rounds, BATCH)
     result["forward_seconds_by_size"] = _by_size(sizes, 2 if quick else ROUNDS)
-    # A compiled contender costs a smoke test half a minute in each child.
-    measured = [name for name in CONTENDERS if not (quick and name in COMPILED)]
+    measured = [*forward, *backward]
     result["peak_extra_megabytes"] = {
         name: measured_apart("speed", "memory", name, *size)["megabytes"] for name in measured
     }
@@ -184,21 +212,49 @@ def _once(name: str, contender: Contender, test: Tensor, reference: Tensor) -> f
 
 
 def _interleaved(
-    makers: dict[str, Callable[[], Contender]],
-    size: tuple[int, int],
-    rounds: int,
-    batch: int = 1,
+    names: Sequence[str], size: tuple[int, int], rounds: int, batch: int = 1
 ) -> dict[str, float]:
     """Return each contender's median seconds, in interleaved runs."""
-    test, reference = images(size, batch)
-    contenders = {name: maker() for name, maker in makers.items()}
-    seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for number in range(rounds + 2):
-        for name, contender in contenders.items():
-            taken = _once(name, contender, test, reference)
-            if number >= 2:  # the first rounds compile and fill caches
-                seconds[name].append(taken)
+    seconds: dict[str, list[float]] = {name: [] for name in names}
+    with ExitStack() as stack:
+        once = {name: stack.enter_context(_served(name, size, batch)) for name in names}
+        for number in range(rounds + 2):
+            for name in names:
+                taken = once[name]()
+                if number >= 2:  # the first rounds compile and fill caches
+                    seconds[name].append(taken)
     return {name: statistics.median(values) for name, values in seconds.items()}
+
+
+@contextmanager
+def _served(
+    name: str, size: tuple[int, int], batch: int
+) -> Generator[Callable[[], float], None, None]:
+    """Have a contender in a process of its own; give what returns the seconds of a call there."""
+    context = get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_serve, args=(theirs, name, size, batch), daemon=True)
+    process.start()
+    theirs.close()
+
+    def once() -> float:
+        ours.send(None)
+        return float(ours.recv())
+
+    try:
+        yield once
+    finally:
+        ours.close()
+        process.join()
+
+
+def _serve(connection: Connection, name: str, size: tuple[int, int], batch: int) -> None:
+    torch.set_num_threads(THREADS)
+    contender, pair = (CONTENDERS | PEERS)[name](), images(size, batch)
+    with suppress(EOFError):  # the end
+        while True:
+            connection.recv()
+            connection.send(_once(name, contender, *pair))
 
 
 def _by_size(sizes: Sequence[tuple[int, int]], rounds: int) -> dict[str, dict[str, float]]:
@@ -296,7 +352,7 @@ def _table(result: dict[str, Any]) -> str:
             ratio = seconds / result[key][yardstick]
             memory = result["peak_extra_megabytes"].get(name, math.nan)
             lines.append(f"| {name} | {seconds:.3f} | {ratio:.2f} | {memory:.0f} |")
-    lines += ["", f"The lower {len(BACKWARD)}: forward and backward.", ""]
+    lines += ["", "Losses: forward and backward.", ""]
     batch = " x ".join(map(str, (result["batch"][0], 3, *result["batch"][1:])))
     lines += [f"Forward and backward, {batch}:", "", "| | seconds | to kornia |", "|---|---|---|"]
     for name, seconds in result["batch_seconds"].items():
