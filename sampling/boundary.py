@@ -16,57 +16,57 @@ from torch_vdm.model.grid import Side
 # Distance of the quartiles of a normal distribution from its mean, in standard deviations.
 QUARTILE = 0.6744897501960817
 
-# A variance of nothing, and the largest, in cone responses squared: in single precision both are
-# numbers, and so are sums of a few of the second. Status: choice.
+# Stand-in for a variance of 0, and the largest variance, in squared cone responses: both are
+# representable in single precision, and so are sums of a few of the second. Status: choice.
 NONE, LARGEST = 1e-37, 1e36
 
 
 class _Axis(NamedTuple):
-    """What the nodes along one axis add to each of their parents: two nodes a parent."""
+    """How the nodes along one axis contribute to their parents, two nodes per parent."""
 
     nodes: Tensor
-    """(2, n), the numbers of the nodes."""
+    """(2, n), the indices of the nodes."""
     low: Tensor
-    """(2, n), their squared weights in the sum of a detail that does not run along this axis."""
+    """(2, n), their squared weights in a detail that is a sum along this axis."""
     high: Tensor
-    """(2, n), in its difference."""
+    """(2, n), the same in a detail that is a difference along it."""
     own: Tensor
-    """(2, n), in the mean of the parent's own pixels."""
+    """(2, n), the same in the mean of the parent's own pixels."""
 
     @property
     def ends(self) -> "_Axis":
-        """The same of the first and the last parent."""
+        """The entries of the first and the last parent."""
         return _Axis(*(part[:, [0, -1]] for part in self))
 
     @property
     def within(self) -> "_Axis":
-        """The same of all others."""
+        """The entries of all other parents."""
         return _Axis(*(part[:, 1:-1] for part in self))
 
     @property
     def inner(self) -> slice:
-        """The nodes of these."""
+        """The nodes of those other parents."""
         return slice(int(self.nodes[0, 1]), int(self.nodes[1, -2]) + 1)
 
 
 def detail_variances(leaves: Tensor, true_means: bool) -> tuple[Tensor, ...]:
-    """Return the variances of the detail coefficients of independent leaves (Section 3).
+    """Return the variances of the detail coefficients of independent pixels (Section 3).
 
-    Inside the image those of a node, and that of its lowpass, are the sum of its four children's
-    over 16. At the border of an odd side they follow what `Haar.decompose` makes of it.
+    Inside the image, the variances of a node's details and of its lowpass are the sum of its four
+    children's over 16. At the border of an odd side they follow `Haar.decompose`.
 
     Parameters
     ----------
     leaves
         (B, C, H, W), not negative.
     true_means
-        As for `Haar.decompose`.
+        As in `Haar.decompose`.
 
     Returns
     -------
     tuple of Tensor
-        One (B, C, 3, h, w) a level, level 0 first: d1 (horizontal), d2 (vertical), d3 (diagonal);
-        (B, C, 1, h, w) where all three have the same.
+        One (B, C, 3, h, w) per level, level 0 first: d1 (horizontal), d2 (vertical), d3 (diagonal);
+        (B, C, 1, h, w) where all three are equal.
     """
     size = (leaves.shape[-2], leaves.shape[-1])
     grid = Haar().grid(size, true_means)
@@ -74,7 +74,7 @@ def detail_variances(leaves: Tensor, true_means: bool) -> tuple[Tensor, ...]:
     nodes = leaves
     while max(nodes.shape[-2:]) > 1:
         counts = nodes.shape[-2], nodes.shape[-1]
-        # As printed, a node with fewer pixels counts for as many as its siblings.
+        # As printed, a node with fewer pixels has the same weight as its siblings.
         sides = grid.sides(size, len(levels)) if true_means else (Side(0, 1.0, 1.0),) * 2
         if all(map(_complete, sides, counts)):
             nodes = functional.avg_pool2d(nodes, 2) * 0.25
@@ -85,7 +85,7 @@ def detail_variances(leaves: Tensor, true_means: bool) -> tuple[Tensor, ...]:
             for side, count in zip(sides, counts, strict=True)
         )
         parents = y.nodes.shape[1], x.nodes.shape[1]
-        # Where a border is all that differs, which it always is on the grid of thirds.
+        # `_bordered` where only the border differs, as it always does on the grid of thirds.
         weighed = _bordered if true_means and min(parents) > 2 else _weighed
         details, nodes = weighed(nodes, y, x)
         levels.append(details)
@@ -111,10 +111,10 @@ def _weighed(nodes: Tensor, y: _Axis, x: _Axis) -> tuple[Tensor, Tensor]:
 
 
 def _bordered(nodes: Tensor, y: _Axis, x: _Axis) -> tuple[Tensor, Tensor]:
-    """Return the same where all but the first and last parents are of four whole nodes."""
+    """Return the same where all but the first and last parents have four whole nodes."""
     inner = functional.avg_pool2d(nodes[..., y.inner, x.inner], 2) * 0.25
     rows = _weighed(nodes, y.ends, x)
-    # Of the columns no more than it takes.
+    # Only the columns that are needed.
     sides = x.ends._replace(nodes=torch.arange(4).view(2, 2))
     columns = _weighed(nodes[..., x.ends.nodes.flatten()], y.within, sides)
 
@@ -127,7 +127,7 @@ def _bordered(nodes: Tensor, y: _Axis, x: _Axis) -> tuple[Tensor, Tensor]:
 
 
 def _complete(side: Side, count: int) -> bool:
-    """Return whether all parents along a side have two of ``count`` nodes, of all their pixels."""
+    """Return whether, along a side of ``count`` nodes, all parents have two whole nodes."""
     return side == Side(0, 1.0, 1.0) and count % 2 == 0
 
 
@@ -142,7 +142,7 @@ def _axis(side: Side, count: int, true_means: bool, dtype: torch.dtype) -> _Axis
     def squares(first: float, second: float) -> Tensor:
         return torch.tensor([first**2, second**2], dtype=torch.float64)
 
-    # Parent, its border node and the one beside that, the pixels it has, whether it is alone.
+    # Parent, its border node and that node's neighbour, its share of pixels, whether it is alone.
     first = 0, (0, 1), side.first, side.before == 1
     last = parents - 1, (count - 1, count - 2), side.last, (count + side.before) % 2 == 1
     for parent, pair, real, alone in (first, last):
@@ -150,11 +150,11 @@ def _axis(side: Side, count: int, true_means: bool, dtype: torch.dtype) -> _Axis
             continue
         nodes[:, parent] = torch.tensor(pair).clamp_min(0)
         if alone and (count == 1 or not true_means):
-            # It stands beside itself.
+            # It is its own neighbour.
             low[:, parent] = own[:, parent] = squares(1.0, 0.0)
             high[:, parent] = 0.0
             continue
-        # The pixels that it lacks are like the node beside it, over which its window reaches back.
+        # The pixels that it lacks are those of its neighbour, into which its window extends.
         half = 0.5 * real
         low[:, parent], high[:, parent] = squares(half, 1.0 - half), squares(half, half)
         own[:, parent] = squares(1.0, 0.0) if alone else squares(real, 1.0) / (1.0 + real) ** 2
@@ -175,34 +175,34 @@ def boundaries(
 ) -> tuple[Cortex, Cortex]:
     """Return the lower and the upper boundary image of a representation.
 
-    Details ``spread`` standard deviations below and above: the paper's 25 % and 75 % points with
-    `QUARTILE`. Their lowpass is that of ``cortex``; the mean, which the calibrated observer
-    compares, spreads as the details do.
+    Their details lie ``spread`` standard deviations below and above: the paper's 25 % and 75 %
+    points with `QUARTILE`. Their lowpass is that of ``cortex``; the mean, which the calibrated
+    observer compares, is spread like the details.
 
     Parameters
     ----------
     cortex
         The current means, in cone space.
     variances
-        Of its details, as `detail_variances` gives them.
+        Variances of its details, as `detail_variances` returns them.
     mean_variance
-        (B, C, 1, 1), of the mean of the image.
+        (B, C, 1, 1), the variance of the mean of the image.
     spread
         In standard deviations.
     signed
-        False, for an observer of magnitudes: abs(d) - spread sigma, not below 0, with the sign of
-        d. True: the boundary crosses zero, so that a small detail spreads as far as a large one.
+        False, for an observer of magnitudes: abs(d) - spread sigma, clamped at 0, with the sign of
+        d. True: the boundary may cross zero, so that a small detail spreads as far as a large one.
     """
     lower: list[Tensor] = []
     upper: list[Tensor] = []
     for detail, variance in zip(cortex.details, variances, strict=True):
-        # Not 0, for the slope of its root there is infinite.
+        # Not 0: the slope of the square root is infinite there.
         margin = spread * variance.clamp_min(NONE).sqrt()
         if signed:
             lower.append(detail - margin)
             upper.append(detail + margin)
         else:
-            # Not torch.sign, for a detail of 0 spreads too.
+            # Not torch.sign: a detail of 0 spreads too.
             sign = torch.where(detail < 0.0, -1.0, 1.0)
             size = detail.abs()
             lower.append(sign * (size - margin).clamp_min(0.0))

@@ -1,4 +1,4 @@
-"""A run on disk: written whole or not at all, continued bit for bit, or refused in words."""
+"""A run on disk: written whole or not at all, continued bit for bit, or refused with a reason."""
 
 import contextlib
 import json
@@ -11,15 +11,15 @@ import numpy as np
 
 from torch_vdm.io.refusal import printable
 
-# What a file says it is, and the number that is raised when its layout changes.
+# The format's name in a file, and its version, which is raised when the layout changes.
 FORMAT = "vdm-render checkpoint"
 FORMAT_VERSION = 1
 
-# The entry of the archive that holds everything but arrays, as JSON, and what comes before the
-# name of an array.
+# The entry of the archive that holds everything but arrays, as JSON, and the prefix of the names
+# of arrays.
 _HEADER, _ARRAY = "header", "array."
 
-# What a run is, and how it is called where two differ.
+# What identifies a run, and its name in messages where two runs differ.
 WORDS = {
     "version": "version of torch-vdm",
     "mitsuba": "version of Mitsuba",
@@ -49,19 +49,19 @@ class CheckpointError(ValueError):
 
 
 class Checkpoint(NamedTuple):
-    """What is kept of a run."""
+    """What is saved of a run."""
 
     identity: dict[str, Any]
-    """What the run is: the scene's hash under "scene", and every key of `WORDS`."""
+    """What identifies the run: the scene's hash under "scene", and every key of `WORDS`."""
     state: dict[str, Any]
     """Arrays, numbers, strings, booleans and None, by name."""
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint; one that exists is replaced once the new one is complete.
+    """Write a checkpoint; an existing one is replaced once the new one is complete.
 
-    An uncompressed NumPy archive (npz) without pickled objects: its arrays, and one string of JSON
-    for everything else.
+    It is an uncompressed NumPy archive (npz) without pickled objects: arrays, and one string of
+    JSON for everything else.
 
     Raises
     ------
@@ -75,8 +75,8 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         "arrays": sorted(arrays),
         "values": {name: v for name, v in checkpoint.state.items() if name not in arrays},
     }
-    # Always the same name: whoever is killed while he writes leaves one file, not many. What lies
-    # there is never written to: it may be a link to something else.
+    # Always the same name: a process killed while writing leaves one file, not many. An existing
+    # file there is never written to: it may be a link to something else.
     temporary = path.with_name(f".{path.name}.partial")
     try:
         temporary.unlink(missing_ok=True)
@@ -99,8 +99,8 @@ def load(path: Path, identity: Mapping[str, Any]) -> dict[str, Any]:
     Raises
     ------
     CheckpointError
-        If the file is missing, damaged or no checkpoint, or was begun with another scene, version
-        or settings.
+        If the file is missing, damaged or not a checkpoint, or the run was begun with another
+        scene, version or settings.
     """
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:

@@ -38,7 +38,7 @@ from torch_vdm.cli import (
 )
 from torch_vdm.io import atomic_path
 
-# What --sensor takes for every sensor of the scene.
+# The value of --sensor for every sensor of the scene.
 ALL = "all"
 
 
@@ -142,11 +142,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 class _Console(Watch):
-    """Prints a line a round where there is no terminal, and counts Ctrl-C.
+    """Prints a line per round where there is no terminal, and counts Ctrl-C.
 
-    The first ends the run after its round, the second at once. A request to terminate, as of a
-    cluster's scheduler, ends it at once too. What there is is written whole all the same; a third
-    Ctrl-C gives that up. Before rendering begins, Ctrl-C is what it always is.
+    The first Ctrl-C ends the run after its round, the second at once. A request to terminate, as
+    a cluster's scheduler sends it, ends it at once too. The result so far is still written whole;
+    a third Ctrl-C gives that up. Before rendering begins, Ctrl-C works as usual.
     """
 
     def __init__(self, tolerance: float) -> None:
@@ -165,7 +165,7 @@ class _Console(Watch):
 
     def begin(self) -> None:
         if threading.current_thread() is not threading.main_thread():
-            return  # of a cluster's worker, whose own signals are
+            return  # a cluster's worker, which handles signals itself
         kinds = signal.SIGINT, signal.SIGTERM
         self._before = {kind: signal.signal(kind, self._note) for kind in kinds}
 
@@ -173,7 +173,7 @@ class _Console(Watch):
         return self._count
 
     def round(self, report: Report | None) -> None:
-        # A continued run has told of its rounds before.
+        # A continued run has already reported its earlier rounds.
         if report is not None and report.round != self._told and not self._silent:
             words = [f"round {report.round}", f"{report.spp:.4g} samples per pixel"]
             words += seen(report, self._tolerance)
@@ -216,7 +216,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
 
 
 def _views(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Render one view, or all that the scene has; return what is known of each."""
+    """Render one view, or all views of the scene; return the figures of each."""
     every = options.sensor == ALL
     sensors: list[int | str] = [0 if every else options.sensor]
     told: list[dict[str, Any]] = []
@@ -232,12 +232,12 @@ def _views(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def _rendered(options: argparse.Namespace, sensor: int | str, number: int | None) -> Result:
-    """Render one view and write what is asked of it; ``number`` of those of all sensors."""
+    """Render one view and write what was asked for; ``number`` counts those of all sensors."""
     output, kept = _numbered(options.output, number), _numbered(_kept(options), number)
     checkpoint = kept if options.checkpoint else None
     if output.suffix.lower() != ".exr":
         raise UsageError(f"{output}: expected a name that ends in .exr")
-    # Before anything is rendered: what could not be written or would destroy an input.
+    # Before anything is rendered, refuse what could not be written or would destroy an input.
     check_outputs((options.scene,), (output, checkpoint, json_path(options)))
     with _warned(), _Console(options.tolerance) as console:
         result = render(
@@ -272,19 +272,19 @@ def _rendered(options: argparse.Namespace, sensor: int | str, number: int | None
 
 
 def _kept(options: argparse.Namespace) -> Path:
-    """Return where the run is kept, if it is."""
+    """Return the path of the run's checkpoint, if there is one."""
     kept: Path = options.checkpoint or options.output.with_name(f"{options.output.name}.checkpoint")
     return kept
 
 
 def _numbered(path: Path, number: int | None) -> Path:
-    """Return the name with a number before its suffix; as it is without one."""
+    """Return the path with a number before its suffix; unchanged without a number."""
     return path if number is None else path.with_name(f"{path.stem}.{number}{path.suffix}")
 
 
 @contextlib.contextmanager
 def _warned() -> Iterator[None]:
-    """Print the renderer's warnings as lines of the program, not what libraries deprecate."""
+    """Print the renderer's warnings as lines of the program, without deprecation warnings."""
 
     def line(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
         if category is UserWarning:
@@ -321,7 +321,7 @@ _ENDINGS = {
 
 
 def _text(figures: dict[str, Any], options: argparse.Namespace) -> str:
-    """Return in words how it ended, what it cost, what was assumed and what was written."""
+    """Return in words how the run ended, its cost, what was assumed and what was written."""
     lines = [_ENDINGS[figures["stop_reason"]]]
     if figures["predicted_max_jnd"] is not None:
         lines[0] += (

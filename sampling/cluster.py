@@ -1,9 +1,9 @@
-"""Many scenes, or many frames of them, rendered by a cluster of Dask: a picture is the unit.
+"""Many scenes, or many frames of them, rendered by a Dask cluster: a picture is the unit of work.
 
-A picture and what is known of it lie beside each other, ``NAME.exr`` and ``NAME.json``. The latter
-has a hash of the scene's files, the settings and the versions: where it is the same the picture
-stands, whoever is asked for it again. While a picture is rendered there is a checkpoint too, from
-which another worker goes on when one dies.
+A picture and its figures lie side by side as ``NAME.exr`` and ``NAME.json``. The latter has a hash
+of the scene's files, the settings and the versions: where it is the same, the picture is kept and
+not rendered again. While a picture is rendered there is also a checkpoint, from which another
+worker continues when one dies.
 """
 
 import argparse
@@ -28,18 +28,18 @@ from torch_vdm.io import ImageError, atomic_path, check_target
 from torch_vdm.io.refusal import printable
 from torch_vdm.report import progress
 
-# The parameter of a scene that a frame's number is given to, and digits of the number in a name.
+# The scene's parameter that receives the frame number, and the digits of that number in a name.
 FRAME, DIGITS = "frame", 4
 
-# What says in an output folder, as JSON, that it is one, and with which settings; no picture's
-# file can be called so.
+# The JSON file that marks an output folder and holds its settings; no picture's file can have
+# this name.
 NAME = "vdm-render.run"
 
-# Workers of this machine: while one decides, on a single processor, the other renders, on all.
+# Workers on this machine: while one decides, on a single processor, the other renders, on all.
 # Status: choice.
 HERE = 2
 
-# Pictures that failed of which the reason is said; --json has all. Status: choice.
+# Failed pictures whose reason is printed; --json has all. Status: choice.
 NAMED = 5
 
 # Options that change no picture.
@@ -48,10 +48,10 @@ NOT_SETTINGS = (
     "parameters",
 )  # fmt: skip
 
-# Renders what the options of one picture say, writes it, and returns what is known of each view.
+# Renders one picture by its options, writes it, and returns the figures of each view.
 Views = Callable[[argparse.Namespace], list[dict[str, Any]]]
 
-# Mitsuba, the number of threads and standard error are the process's, not a thread's.
+# Mitsuba, the number of threads and standard error belong to the process, not to a thread.
 _one = threading.Lock()
 
 
@@ -62,7 +62,7 @@ class Picture(NamedTuple):
     frame: int | None
 
     def __str__(self) -> str:
-        """Return what it is called in messages."""
+        """Return its name in messages."""
         return f"{self.scene}" + ("" if self.frame is None else f", frame {self.frame}")
 
     @property
@@ -73,7 +73,7 @@ class Picture(NamedTuple):
 
 
 class Done(NamedTuple):
-    """What came of a picture: what is known of each of its views, or why there is none."""
+    """The outcome of a picture: the figures of each of its views, or why there are none."""
 
     views: list[dict[str, Any]]
     failed: str = ""
@@ -82,7 +82,7 @@ class Done(NamedTuple):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say what many pictures are, and who renders them."""
+    """Add the options that choose many pictures and what renders them."""
     many = parser.add_argument_group(
         "many pictures", "several scenes, or frames: --output is then a folder"
     )
@@ -104,7 +104,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def are_many(options: argparse.Namespace) -> bool:
-    """Say whether many pictures are asked for, or one that a cluster is to render."""
+    """Return whether many pictures are asked for, or one that a cluster is to render."""
     return bool(
         len(options.scenes) > 1
         or options.frames is not None
@@ -114,21 +114,21 @@ def are_many(options: argparse.Namespace) -> bool:
 
 
 def render_all(options: argparse.Namespace, views: Views) -> tuple[str, bool]:
-    """Have all pictures rendered, and write them into the output folder.
+    """Render all pictures on the workers and write them into the output folder.
 
-    One that cannot be rendered is told and counted, and the others are rendered all the same.
+    One that cannot be rendered is reported and counted, and the others are still rendered.
 
     Parameters
     ----------
     options
-        The command's.
+        The command's options.
     views
-        Renders one picture; workers find it by its name.
+        Renders one picture; workers look it up by name.
 
     Returns
     -------
     tuple
-        What is said of all pictures, and whether any of them failed.
+        The summary of all pictures, and whether any of them failed.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def render_all(options: argparse.Namespace, views: Views) -> tuple[str, bool]:
         contextlib.closing(answers(sent, pictures, told, scheduler, workers)) as coming,
         progress("rendering", len(pictures)) as advance,
     ):
-        said = sys.stderr  # before a worker in this process takes it for its own
+        said = sys.stderr  # before a worker in this process redirects it
         try:
             for picture, done in coming:
                 done = done or Done(
@@ -184,7 +184,7 @@ def render_all(options: argparse.Namespace, views: Views) -> tuple[str, bool]:
 
 
 class _Sum:
-    """What is said of all pictures, from a few numbers of each."""
+    """The summary of all pictures, from a few numbers of each."""
 
     def __init__(self) -> None:
         self._ended: Counter[str] = Counter()
@@ -198,7 +198,7 @@ class _Sum:
         for figures in done.views:
             self._ended[figures["stop_reason"]] += 1
             self._samples += figures["samples_total"]
-            # In a JSON file read again infinity is none.
+            # Infinity comes back from a JSON file as None.
             largest = figures["predicted_max_jnd"]
             if largest is not None:
                 self._worst = max(self._worst, (largest, str(picture)))
@@ -214,7 +214,7 @@ class _Sum:
 
 
 def _pictures(options: argparse.Namespace) -> list[Picture]:
-    """Return what is to be rendered, each with a name of its own."""
+    """Return the pictures to render, each with a name of its own."""
     frames = [None] if options.frames is None else options.frames
     pictures = [Picture(scene, frame) for scene in options.scenes for frame in frames]
     named: dict[str, Picture] = {}
@@ -231,7 +231,7 @@ def _pictures(options: argparse.Namespace) -> list[Picture]:
 
 
 def _prepare(options: argparse.Namespace, pictures: list[Picture]) -> None:
-    """Make the output folder, where none with results is in the way."""
+    """Make the output folder, unless one with results is in the way."""
     output: Path = options.output
     if options.checkpoint is not None:
         raise ClusterError(
@@ -255,7 +255,7 @@ def _prepare(options: argparse.Namespace, pictures: list[Picture]) -> None:
 
 
 def _told(options: argparse.Namespace, folder: Path, picture: Picture) -> tuple[argparse.Namespace]:
-    """Return the options of one picture, as they are from any folder."""
+    """Return the options of one picture, valid from any folder."""
     own = argparse.Namespace(**vars(options))
     own.scene, own.output, own.json = picture.scene.absolute(), folder / picture.name, None
     own.checkpoint = own.output.with_suffix(".checkpoint")
@@ -266,7 +266,7 @@ def _told(options: argparse.Namespace, folder: Path, picture: Picture) -> tuple[
 
 
 def _done(views: Views, options: argparse.Namespace) -> Done:
-    """Render a picture on a worker, unless it is there."""
+    """Render a picture on a worker, unless it is already there."""
     with _one, contextlib.redirect_stderr(io.StringIO()) as said:
         try:
             done = _rendered(views, options)
@@ -274,9 +274,9 @@ def _done(views: Views, options: argparse.Namespace) -> Done:
             return Done([], str(error))
         except (ImageError, ClusterError):
             raise
-        except ValueError as error:  # of settings, of a checkpoint that cannot be written
+        except ValueError as error:  # bad settings, or a checkpoint that cannot be written
             raise ClusterError(str(error)) from error
-        except (RuntimeError, MemoryError) as error:  # of Mitsuba, of this scene
+        except (RuntimeError, MemoryError) as error:  # from Mitsuba, on this scene
             return Done([], f"{type(error).__name__}: {printable(str(error)).strip()}")
     mark = "warning: "
     warned = (line.partition(mark)[2] for line in said.getvalue().splitlines() if mark in line)
@@ -288,7 +288,7 @@ def _rendered(views: Views, options: argparse.Namespace) -> Done:
     known = _known(record, options)
     if known is not None:
         return Done(known, stood=True)
-    # Of another picture, which this one is written over.
+    # It belongs to another picture, which this one overwrites.
     record.unlink(missing_ok=True)
     kept = _kept(options)
     options.resume = bool(kept)
@@ -297,13 +297,13 @@ def _rendered(views: Views, options: argparse.Namespace) -> Done:
     except CheckpointError:
         if not kept:
             raise
-        # Of other settings, or of two workers that wrote it at once.
+        # It has other settings, or two workers wrote it at once.
         for path in kept:
             path.unlink(missing_ok=True)
         options.resume = False
         told = views(options)
     for figures in told:
-        figures["written"] = figures["written"][:1]  # its checkpoint goes
+        figures["written"] = figures["written"][:1]  # its checkpoint is deleted
     key = _key(options, *(told[0][name] for name in ("mitsuba", "variant", "fingerprint")))
     with atomic_path(record) as temporary:
         temporary.write_text(json.dumps({"key": key, "views": told}, indent=1) + "\n")
@@ -313,24 +313,24 @@ def _rendered(views: Views, options: argparse.Namespace) -> Done:
 
 
 def _key(options: argparse.Namespace, mitsuba: str, variant: str, fingerprint: str) -> str:
-    """Return the hash of all that a picture depends on; ``fingerprint`` is of its scene."""
+    """Return the hash of all that a picture depends on; ``fingerprint`` is its scene's."""
     told = json.dumps([__version__, mitsuba, variant, fingerprint, _settings(options)])
     return hashlib.sha256(told.encode()).hexdigest()
 
 
 def _settings(options: argparse.Namespace) -> dict[str, object]:
-    """Return the options on which pictures depend, but for the scene and its parameters."""
+    """Return the options on which pictures depend, except the scene and its parameters."""
     return {
         name: value for name, value in sorted(vars(options).items()) if name not in NOT_SETTINGS
     }
 
 
 def _known(record: Path, options: argparse.Namespace) -> list[dict[str, Any]] | None:
-    """Return what is known of a picture that is there, of this scene and these settings."""
+    """Return the figures of an existing picture of this scene with these settings."""
     try:
         told = json.loads(record.read_text())
         views: list[dict[str, Any]] = told["views"]
-        # By its name, for the folder may have been moved.
+        # By name only, because the folder may have been moved.
         files = [record.with_name(Path(figures["written"][0]).name) for figures in views]
         key: str = told["key"]
     except (OSError, ValueError, LookupError, TypeError):
@@ -345,9 +345,9 @@ def _known(record: Path, options: argparse.Namespace) -> list[dict[str, Any]] | 
 
 
 def _kept(options: argparse.Namespace) -> list[Path]:
-    """Return the checkpoints of a picture: of its view, or of each of its views, by number."""
+    """Return the existing checkpoints of a picture: of its view, or of all its views by number."""
     checkpoint: Path = options.checkpoint
-    if options.sensor != "all":  # numbered ones are of a scene with such a name
+    if options.sensor != "all":  # numbered ones belong to a scene with such a name
         return [checkpoint] if checkpoint.is_file() else []
     names = (f"{checkpoint.stem}.{number}{checkpoint.suffix}" for number in count())
     views = takewhile(Path.is_file, map(checkpoint.with_name, names))
@@ -355,7 +355,7 @@ def _kept(options: argparse.Namespace) -> list[Path]:
 
 
 def _all(folder: Path, pictures: list[Picture], failed: dict[Picture, str]) -> str:
-    """Return what is known of all pictures as JSON: of each, in order, a list of its views."""
+    """Return the figures of all pictures as JSON: for each, in order, a list of its views."""
     told: list[object] = []
     for picture in pictures:
         if picture in failed:

@@ -1,7 +1,7 @@
 """The trees of local, maximum and total error.
 
 "Local visual difference prediction" and "update maximum error tree" of Fig. 8. The local errors
-come from `VDM.local_differences`, in JND to the power of the summation.
+come from `VDM.local_differences`, in JND to the power of the summation exponent.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ def maximum(local: Sequence[Tensor], grid: Grid) -> tuple[Tensor, ...]:
     Parameters
     ----------
     local
-        One (B, 1, h, w) a level, level 0 (the root) first; not negative.
+        One (B, 1, h, w) per level, level 0 (the root) first; not negative.
     grid
         Where the nodes lie.
 
@@ -43,16 +43,16 @@ def total(local: Sequence[Tensor], largest: Sequence[Tensor], grid: Grid) -> tup
     Parameters
     ----------
     local
-        One (B, 1, h, w) a level, level 0 first.
+        One (B, 1, h, w) per level, level 0 first.
     largest
-        What `maximum` gives for it.
+        What `maximum` returns for it.
     grid
         Where the nodes lie.
 
     Returns
     -------
     tuple of Tensor
-        The same shapes. Level 0, and the largest of each level, are the largest of the tree; the
+        The same shapes. Level 0, and the maximum of each level, equal the maximum of the tree; the
         finest level is the error accumulated down every path.
     """
     levels: list[Tensor] = []

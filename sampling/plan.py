@@ -1,13 +1,13 @@
-"""What of a scene is simulated: what it needs, and what anyone could see of it.
+"""Which effects of a scene are simulated: those that it needs and that anyone could see.
 
 First the scene is read: without media no volumetric integrator is needed, and where no surface
-scatters no light has been reflected twice. Then a pilot tells what each further bounce of the light
-adds, and the metric whether anyone could see it. What is left out has a bound in JND, and the noise
-may take only what the bound leaves of the tolerance: both together stay within it.
+scatters, no light has been reflected twice. Then a pilot measures what each further bounce of light
+adds, and the metric judges whether anyone could see it. What is left out has a bound in JND, and
+the noise may use only the rest of the tolerance: both together stay within it.
 
 The pilot is the first round of the run, and its samples stay in the picture. Where nothing is left
-out it is that of ``--effects full``, bit for bit; where paths are cut, that of a scene that asks
-for no longer ones.
+out, the picture is that of ``--effects full``, bit for bit; where paths are cut, it is that of a
+scene that asks for no longer ones.
 """
 
 import math
@@ -25,34 +25,35 @@ from sampling.renderers.needs import PATH, Needs
 from sampling.sampler import Request, Sampler, Settings
 from sampling.statistics import Statistics
 
-# What `effects` may be.
+# The values of `effects`.
 AUTO, FULL = "auto", "full"
 
-# Most of the tolerance that what is left out may take. Status: choice.
+# Largest share of the tolerance that what is left out may use. Status: choice.
 SHARE = 0.25
 
 # Depths at which paths may be cut, in segments. Status: choice.
 CUTS = (2, 3, 4, 6, 8, 12)
 
-# Samples of each pixel that a pilot must have to tell anything. Pixels at least, for its code takes
-# a quarter of a second to compile, and at most, for it is held in memory, 576 bytes each. Status:
-# choices.
+# Fewest samples per pixel from which a pilot can tell anything. Fewest pixels, because its code
+# takes a quarter of a second to compile, and most pixels, because it is kept in memory, 576 bytes
+# each. Status: choices.
 FEWEST_SAMPLES, FEWEST_PIXELS, MOST_PIXELS = 16, 2**18, 2**20
 
-# Before it, one sample each of about so many pixels says whether a cut could save anything, and
-# would not show at once: by the mean of the picture, of which at some place there is more. Status:
-# choice; a bound was 4 to 10 times the mean's difference on dim rooms and open scenes.
+# Before the pilot, one sample each of about so many pixels tells whether a cut could save anything
+# and would not obviously show. The mean of the picture decides that, with a factor because some
+# places differ more. Status: choice; a bound was 4 to 10 times the mean's difference on dim rooms
+# and open scenes.
 GLANCED, LOCAL = 2**13, 4.0
 
-# Samples grow by this power of the tolerance as it falls. Status: measured, the Cornell box from 2
-# to 1 JND, 249 and 1,200 samples a pixel.
+# The samples grow with this power of one over the tolerance. Status: measured, the Cornell box from
+# 2 to 1 JND, 249 and 1,200 samples per pixel.
 STEEP = 2.3
 
-# What is left must cost at most this share, or all is kept. Status: choice.
+# The rest must cost at most this share, or everything is kept. Status: choice.
 WORTH = 0.95
 
 # Paths that compiled code follows together, until the longest has ended. Status: choice, as with
-# AVX-512; the same on every machine, for the image must not depend on it.
+# AVX-512; the same on every machine, because the image must not depend on it.
 LANES = 16
 
 # Samples that are drawn at once. Status: choice.
@@ -64,21 +65,21 @@ class Plan:
     """What is simulated, and what is not."""
 
     integrator: str | None
-    """In place of the scene's own; None: its own."""
+    """The integrator in place of the scene's own; None: its own."""
     max_depth: int | None
     """Most path segments of ``integrator``; None: no limit."""
     bound: float
-    """JND by which what is left out may show; 0 where it is nothing."""
+    """Bound in JND on how much of what is left out may show; 0 where nothing is."""
     left_out: tuple[str, ...]
-    """In words, with why."""
+    """What is left out, in words with reasons."""
     kept: tuple[str, ...]
-    """What was looked at and kept, with why."""
+    """What was considered and kept, with reasons."""
     evidence: dict[str, Any]
     """What was measured: figures by name."""
 
     @classmethod
     def of(cls, kept: str) -> Self:
-        """Return the plan that leaves out nothing, for one reason."""
+        """Return the plan that leaves out nothing, with the reason."""
         return cls(None, None, 0.0, (), (kept,), {})
 
     def ended(self) -> Self:
@@ -86,7 +87,7 @@ class Plan:
         return replace(self, kept=(*self.kept, "every bounce: the run ended with its first round"))
 
     def words(self) -> list[str]:
-        """Return what is left out and what is kept, a line each."""
+        """Return what is left out and what is kept, one line each."""
         return [f"left out: {each}" for each in self.left_out] + [
             f"kept: {each}" for each in self.kept
         ]
@@ -102,7 +103,7 @@ class Plan:
         }
 
     def state(self) -> dict[str, Any]:
-        """Return what `restored` takes, of numbers, strings and lists."""
+        """Return the plan as numbers, strings and lists, for `restored`."""
         return asdict(self)
 
     @classmethod
@@ -115,7 +116,7 @@ class Plan:
 def read(
     needs: Needs, effects: str, settings: Settings, size: tuple[int, int]
 ) -> tuple[Plan, bool]:
-    """Return what the scene by itself says, and whether a pilot is to say more."""
+    """Return the plan by the scene alone, and whether a pilot is to refine it."""
     if effects == FULL:
         return Plan.of("all that the scene names, as asked"), False
     if needs.integrator is None:
@@ -158,7 +159,7 @@ def _volumetric(needs: Needs) -> str | None:
 
 
 def _unpiloted(needs: Needs, settings: Settings, size: tuple[int, int]) -> str | None:
-    """Return why every bounce is kept without a pilot; None: a pilot is to say."""
+    """Return why every bounce is kept without a pilot; None: a pilot is to decide."""
     if needs.max_depth is not None and needs.max_depth <= CUTS[0]:
         return f"paths of {needs.max_depth} segments, as the scene has it"
     if not needs.tellable:
@@ -180,26 +181,25 @@ def _unpiloted(needs: Needs, settings: Settings, size: tuple[int, int]) -> str |
 
 
 class Pilot:
-    """The first round of a run, in which the bounces are told apart.
+    """The first round of a run, with the light separated by bounces.
 
-    ``steps`` draws it for the sampler of the run, as it would be without a plan. When that has
-    decided for the first time, ``settle`` says what is cut.
+    ``steps`` draws it for the sampler of the run, as it would be drawn without a plan. After the
+    sampler's first decision, ``settle`` decides what is cut.
 
     Parameters
     ----------
     plan
-        What the scene by itself says.
+        The plan by the scene alone.
     renderer
-        Whose pixels are drawn. It is left as the plan wants it.
+        Draws the samples. It is left set up for the plan.
     sampler
-        That of the run, without any samples.
+        The sampler of the run, without any samples.
 
     Attributes
     ----------
     plan, sampler
-        Those given, until it is settled. Where there is a cut the sampler is another one, which has
-        the pilot's samples without what is cut, and goes on as if the scene had never asked for
-        more.
+        Those given, until ``settle``. With a cut the sampler is another one, which has the pilot's
+        samples without what is cut, and continues as if the scene had never asked for more.
     """
 
     def __init__(self, plan: Plan, renderer: MitsubaRenderer, sampler: Sampler) -> None:
@@ -209,13 +209,13 @@ class Pilot:
         self._metric = sampler.metric
         self._tolerance = sampler.settings.tolerance
         self._depth = renderer.needs.max_depth
-        # Where a cut may be, and the share of all segments that it leaves.
+        # The depth of a possible cut, and the share of all segments that it leaves.
         self._cut: int | None = None
         self._cost = 1.0
         self._held: list[Bounced] = []
 
     def steps(self) -> Iterator[int]:
-        """Draw; yield after each part how many samples it had."""
+        """Draw the round in parts; yield the number of samples of each."""
         self._glance()
         yield 0
         request = self.sampler.ask()
@@ -225,7 +225,7 @@ class Pilot:
             yield part.samples
 
     def _drawn(self, part: Request) -> Samples:
-        """Draw a part, and hold what it is with the cut, if there may be one."""
+        """Draw a part, and keep its light with the cut, if there may be one."""
         which = part.pixels, part.first, part.count
         if self._cut is None:
             return self._renderer.sample(*which)
@@ -234,7 +234,7 @@ class Pilot:
         return found.samples
 
     def settle(self) -> None:
-        """Decide, after the first decision of the sampler."""
+        """Decide on the cut, after the first decision of the sampler."""
         report, cut, held = self.sampler.report(), self._cut, self._held
         assert report is not None
         self._held = []
@@ -251,12 +251,12 @@ class Pilot:
         self._judge(cut, short, self.sampler.largest_without(rest))
 
     def _glance(self) -> None:
-        """Find where a cut may save something and may not show, by one sample of some pixels.
+        """Find a cut that may save something and may not show, by one sample of some pixels.
 
-        The mean of the picture alone must not show it: every difference has at least that one.
+        The mean of the picture alone must not show it: no difference is less than that of the mean.
         """
         pixels = np.arange(math.prod(self._renderer.size))
-        # Packets of neighbours, as they are drawn.
+        # Packets of neighbouring pixels, as they are drawn.
         pixels = pixels[pixels // LANES % max(len(pixels) // GLANCED, 1) == 0]
         ones, most = np.ones_like(pixels), SHARE * self._tolerance / LOCAL
         reason = "every bounce: paths end early by themselves, and a cut would save too little"
@@ -282,13 +282,13 @@ class Pilot:
             self._renderer.aov_sums[:] = 0.0
 
     def _of_means(self, whole: NDArray[np.float64], part: NDArray[np.float64]) -> float:
-        """Return the visible difference of two plain pictures of one pixel."""
+        """Return the visible difference of two uniform pictures, of one pixel each."""
         pair = (torch.from_numpy(mean).reshape(1, 3, 1, 1) for mean in (whole, part))
         with torch.no_grad():
             return float(self._metric(*pair).amax())
 
     def _judge(self, cut: int, short: Sampler, bound: float) -> None:
-        """Decide on a cut that may show by no more than a bound."""
+        """Decide on a cut that shows by at most ``bound`` JND."""
         tolerance, most, cost = self._tolerance, SHARE * self._tolerance, self._cost
         evidence = {
             "segments": cut,
@@ -338,12 +338,12 @@ def _mean(light: NDArray[np.float32]) -> NDArray[np.float64]:
 def _cost(segments: NDArray[np.float32], cut: int) -> float:
     """Return the share of all segments that are followed with a cut.
 
-    A count, and no time: the same run must decide the same.
+    It is a count, not a time: the same run must decide the same.
     """
     packets = np.pad(segments, (0, -len(segments) % LANES)).reshape(-1, LANES).max(1)
     return float(np.minimum(packets, cut).sum() / max(float(packets.sum()), 1.0))
 
 
 def _dearer(share: float) -> float:
-    """Return how many times as many samples it takes where noise may not have all."""
+    """Return the factor on the samples where noise may not use a share of the tolerance."""
     return math.inf if share >= 1.0 else (1.0 - share) ** -STEEP

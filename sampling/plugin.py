@@ -1,6 +1,6 @@
-"""An integrator of Mitsuba that nests another and stops when nobody can see what is missing.
+"""A Mitsuba integrator that nests another and stops when nobody can see what is missing.
 
-``sampling.register_integrator()`` makes it known; in a scene it is
+``sampling.register_integrator()`` registers it; in a scene it is
 
     <integrator type="vdm">
         <float name="tolerance" value="1"/>
@@ -24,17 +24,17 @@ NAME = "vdm"
 
 
 def register_integrator() -> None:
-    """Make the integrator ``vdm`` known to the variant of Mitsuba that is set.
+    """Register the integrator ``vdm`` with the active variant of Mitsuba.
 
     Its parameters are those of `render` that a scene may state: ``tolerance`` (JND), ``ppd`` and
     ``white`` (cd/m2), floats; ``strategy``, ``filter`` and ``effects``, strings; ``unbiased``, a
-    boolean; and Mitsuba's ``timeout`` in seconds. In it is the integrator that gives the light.
+    boolean; and Mitsuba's ``timeout`` in seconds. The nested integrator computes the light.
 
-    In `mi.render`, ``seed`` and ``sensor`` are what they are elsewhere. ``spp`` is the most samples
-    that a pixel may get; 0: as many as it takes, for the sampler of the scene, with its number of
-    samples, is not asked. The picture has the film's channels, alpha and the nested integrator's
-    AOVs among them; with ``develop=False`` it stays in the film. There are no derivatives.
-    The last picture, and why it was enough, is the integrator's ``result``, a `Result`.
+    In `mi.render`, ``seed`` and ``sensor`` have their usual meaning. ``spp`` is the most samples
+    that a pixel may get; 0: as many as it takes, since the scene's sampler and its number of
+    samples are not used. The picture has the film's channels, including alpha and the nested
+    integrator's AOVs; with ``develop=False`` it stays in the film. There are no derivatives.
+    The integrator's ``result``, a `Result`, holds the last picture and why it was enough.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def register_integrator() -> None:
         )
     base: Any = mi.SamplingIntegrator
 
-    class VisibleDifferenceIntegrator(base):  # type: ignore[misc]  # known when Mitsuba is
+    class VisibleDifferenceIntegrator(base):  # type: ignore[misc]  # known once Mitsuba is loaded
         """Renders with another integrator until nobody can see what is missing."""
 
         def __init__(self, properties: Any) -> None:
@@ -85,7 +85,7 @@ def register_integrator() -> None:
             seed: Any = 0,
             spp: int = 0,
             develop: bool = True,
-            evaluate: bool = True,  # noqa: ARG002  # Mitsuba's signature; it always is
+            evaluate: bool = True,  # noqa: ARG002  # Mitsuba's signature; always evaluated
         ) -> Any:
             """Render; return the developed film, or an empty tensor without ``develop``."""
             view = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
@@ -102,7 +102,7 @@ def register_integrator() -> None:
             names = self.aov_names()
             film.prepare(names)
             planes = dict(self.result.aovs)
-            # The film's channels: R, G, B, A where it has it, the weight, and the AOVs.
+            # The film's channels: R, G, B, A if it has one, the weight, and the AOVs.
             alpha = [planes.pop(ALPHA)] if ALPHA in planes else []
             weight = np.ones(self.result.samples.shape)
             channels = [*np.moveaxis(self.result.image, -1, 0), *alpha, weight, *planes.values()]
@@ -113,20 +113,20 @@ def register_integrator() -> None:
         def sample(
             self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
         ) -> Any:
-            """Return what the nested integrator does, for whoever asks ray by ray."""
+            """Return the nested integrator's result, for callers that sample single rays."""
             return self.nested.sample(scene, sampler, ray, medium, active)
 
         def aov_names(self) -> list[str]:
-            """Return those of the nested integrator."""
+            """Return the names of the nested integrator's AOVs."""
             names: list[str] = self.nested.aov_names()
             return names
 
         def traverse(self, callback: Any) -> None:
-            """Show what it is made of."""
+            """Expose the nested integrator."""
             callback.put("nested", self.nested, mi.ParamFlags.NonDifferentiable)
 
         def to_string(self) -> str:
-            """Return its name and what is in it."""
+            """Return its name and the nested integrator."""
             return f"VisibleDifferenceIntegrator[\n  nested = {self.nested}\n]"
 
     mi.register_integrator(NAME, VisibleDifferenceIntegrator)

@@ -1,7 +1,7 @@
-"""What the samples say of the visible difference between the current image and the converged one.
+"""Predictions of the visible difference between the current image and the converged one.
 
-Two predictions from one set of statistics. *Boundary images* (the paper's) say where the error
-is: they place samples. *Simulation* says how large its maximum is: it stops.
+There are two, from one set of statistics. *Boundary images* (the paper's) locate the error: they
+place samples. *Simulation* estimates its maximum: it decides when to stop.
 """
 
 import math
@@ -24,41 +24,41 @@ from torch_vdm.model.cortex import Cortex
 from torch_vdm.model.grid import Grid
 from torch_vdm.model.matrix import mix
 
-# Images that are simulated for one prediction: as many as have `SIMULATED` pixels together. The
-# maximum of a small image scatters more (10 to 20 % at 32x32, 5 % at 128x128), so that more are
-# needed to know its mean to 2 %. Status: choice, measured.
+# Images simulated for one prediction: as many as have `SIMULATED` pixels in total. The maximum of
+# a small image scatters more (10 to 20 % at 32x32, 5 % at 128x128), so more images are needed to
+# know its mean to 2 %. Status: choice, measured.
 FEWEST_DRAWS, MOST_DRAWS, SIMULATED = 16, 64, 2**18
 
-# The predicted maximum lies this many standard deviations over the mean of the simulated ones;
-# their own variance, and that of the prediction's error, as a share of the mean, are added. The
-# first is where 99 % of simulated maxima lie (97 %, which are skewed, at 1.8 to 2.3 by scene), the
-# second half of what the model was wrong by where it was worst on the safe side.
+# The predicted maximum lies `QUANTILE` standard deviations above the mean of the simulated maxima.
+# The variance is theirs plus that of the prediction's error, `INEXACT` of the mean. The first is
+# where 99 % of simulated maxima lie (they are skewed: 97 % at 1.8 to 2.3, by scene), the second is
+# half of the model's largest error on the safe side.
 # Status: fitted to the honest stop, see docs/sampling.md.
 QUANTILE, INEXACT = 2.5, 0.03
 
-# Power of differences that stands for a maximum where a derivative is needed. Status: choice,
-# measured.
+# Exponent of the power sum of differences that replaces a maximum where a derivative is needed.
+# Status: choice, measured.
 SHARPNESS = 10.0
 
-# Power of differences that stands for the largest of those that scatter: the maximum of many that
-# have a tail of this power scatters by 1.28 over it, and that of differences does by 5 to 10 %.
-# Status: derived, rounded.
+# Exponent of the power sum that replaces the maximum of differences that scatter. The maximum of
+# many values with a power-law tail of this exponent scatters by 1.28 over the exponent; that of
+# differences scatters by 5 to 10 %. Status: derived, rounded.
 SOFTNESS = 20.0
 
-# Share of the samples that is spread evenly over all pixels that have shown noise, whatever is
-# believed of them: what is believed is sometimes wrong, and a pixel without samples does not tell.
+# Share of the samples that is spread evenly over all pixels that have shown noise, whatever the
+# model predicts for them: it is sometimes wrong, and a pixel without samples cannot show it.
 # Status: choice, measured, of 0, 0.05, 0.1, 0.2, 0.33.
 EVEN = 0.05
 
-# Variances of itself that a single detail must have to be taken for one: where samples are placed,
-# by the image as plain as it may be, and where it is simulated, to stop. Status: choices, measured,
-# see docs/sampling.md.
+# How many times its variance the square of a single detail must be to count as a detail: for
+# placing samples, by the image as plain as it may be, and for the simulation that decides to stop.
+# Status: choices, measured, see docs/sampling.md.
 PLACING_DOUBT, STOPPING_DOUBT = 9.0, 4.0
 
 # Nodes on each side over which the simulated totals are averaged. Status: choice.
 SURROUNDINGS = 2
 
-# Numbers of one simulated plane that are computed at once. Status: choice.
+# Values of simulated planes that are computed at once. Status: choice.
 AT_ONCE = 2**18
 
 
@@ -68,13 +68,13 @@ class Model:
     Parameters
     ----------
     metric
-        Who judges.
+        The metric that judges.
     statistics
-        Of the samples so far.
+        Statistics of the samples so far.
     size
         Height and width.
     look
-        Called before each long piece of work: whoever must not wait for all of it raises.
+        Called before each long piece of work; it may raise to end the work early.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Model:
         self._look = look
         self.size = size
         self.count = np.maximum(statistics.count, 1).reshape(size)
-        # Nothing is known of a pixel without a finite sample, and no sample will help.
+        # Nothing is known of a pixel without a finite sample, and more samples will not help.
         seen = (statistics.count > 0).reshape(size)
         self.single = pooled_covariance(statistics, size) * seen
         # Where samples have differed.
@@ -97,12 +97,12 @@ class Model:
         self.true_means = metric.observer.true_means
         self.exponent = metric.observer.summation_exponent
         self.to_cones = _to_cones(metric)
-        # Of a single sample, and of the mean of them.
+        # The variance of a single sample, and of their mean.
         self.single_variance = self._cone_variance()
         self.variance = self.single_variance / torch.from_numpy(self.count)
-        # Of the totals of the boundary images, once there are simulated ones to correct them by.
+        # Factor on the totals of the boundary images, once there are simulated ones to compare.
         self.correction: Tensor | None = None
-        # Of the details, which are estimated from them in single precision.
+        # Variances of the details, which are estimated from them in single precision.
         self.details = detail_variances(self.variance.float(), self.true_means)
         with torch.no_grad():
             self.cortex = self._lit(metric.represent(self.mean))
@@ -111,15 +111,15 @@ class Model:
     def totals(self, count: NDArray[np.float64] | None = None) -> Tensor:
         """Return the total error of the finest nodes by the boundary images, (1, 1, h, w).
 
-        In JND to the power of the summation. With ``count``, (H, W), what it would be had each
-        pixel so many samples.
+        It is in JND to the power of the summation exponent. With ``count``, (H, W), it is what the
+        error would be if each pixel had that many samples.
         """
         with torch.no_grad():
             return self._corrected(self._now if count is None else self._uncorrected(count))
 
     @cached_property
     def _now(self) -> Tensor:
-        """The totals for the samples so far, as the boundary images have them."""
+        """The totals for the samples so far, by the boundary images without correction."""
         return self._uncorrected(None)
 
     def _uncorrected(self, count: NDArray[np.float64] | None) -> Tensor:
@@ -127,10 +127,10 @@ class Model:
         return _finest(self.errors.at(self.leaves(count)), self.cortex.grid)
 
     def largest(self, count: NDArray[np.float64] | None = None) -> float:
-        """Return what stands for the largest of the `totals` in a run, in which they scatter.
+        """Return a soft maximum of the `totals`, which scatter within a run.
 
-        The root of their sum to the power of `SOFTNESS`: what is seen falls little where the
-        highest of them fall, and others that are nearly as high stay.
+        It is the root of the sum of the differences to the power of `SOFTNESS`: it falls little
+        where the highest totals fall and others that are nearly as high stay.
         """
         totals = self.totals(count)
         most = float(totals.amax())
@@ -140,9 +140,10 @@ class Model:
         return most * math.pow(float(((totals / most) ** power).sum()), 1.0 / power)
 
     def leaves(self, count: NDArray[np.float64] | None = None) -> Tensor:
-        """Return the variance of each pixel as `errors` takes it, (1, 3, H, W), single precision.
+        """Return the variance of each pixel for `errors`, (1, 3, H, W), in single precision.
 
-        With ``count``, (H, W), what it would be had each pixel so many samples.
+        With ``count``, (H, W), it is what the variance would be if each pixel had that many
+        samples.
         """
         samples = torch.from_numpy(self.count if count is None else count)
         return self.single_variance.float() / samples.float()
@@ -159,11 +160,11 @@ class Model:
         return self._estimated(_textured)
 
     def _lit(self, cortex: Cortex) -> Cortex:
-        """Return the image to whose noise the eye is adapted as to its light, in the mean square.
+        """Return the image with its noise added to the adapting light, in the mean square.
 
-        What boundary images and simulated ones are compared at. On black the former have no light
-        to be adapted to, so that the eye would be blind to their noise; the latter have any, next
-        to none in places, so that it would see all of it.
+        Boundary images and simulated ones are compared at this adaptation. On black the former have
+        no light to adapt to, so the eye would be blind to their noise; the latter have some, next
+        to none in places, so it would see all of it.
         """
         lit = tuple(
             torch.hypot(window, variance.mean(2).sqrt().to(window))
@@ -172,31 +173,31 @@ class Model:
         return cortex._replace(windows=lit or None)
 
     def _estimated(self, estimate: Callable[[Tensor, Tensor], Tensor]) -> Cortex:
-        """Return the image with its details as estimated from them and their variances."""
+        """Return the image with details estimated from its own and their variances."""
         most = math.sqrt(LARGEST)
         own = (detail.clamp(-most, most).float() for detail in self.cortex.details)
         details = map(estimate, own, self.details)
         return self.cortex._replace(details=tuple(details))
 
     def shares(self) -> NDArray[np.float64]:
-        """Return what share of the samples each pixel should have, (H, W), not negative.
+        """Return the share of the samples that each pixel should have, (H, W), not negative.
 
-        How much its noise adds to the largest totals: the mean of what that is of the image as
-        plain and as textured as it may be. `EVEN` of all is shared by all that are noisy.
+        It is how much the pixel's noise adds to the largest totals, averaged over the image as
+        plain and as textured as it may be. A share `EVEN` is divided among all noisy pixels.
         """
         found = self._slopes(self.truth, self.textured)
         noisy = torch.from_numpy(self.noisy.astype(np.float64))[None, None]
-        # And near there: not only where they were lucky.
+        # And around them: not only where samples happened to hit.
         even = functional.max_pool2d(noisy, 2 * SURROUNDINGS + 1, 1, SURROUNDINGS)[0, 0]
         even = even / even.sum().clamp_min(1.0)
         shares: NDArray[np.float64] = ((1.0 - EVEN) * found + EVEN * even).numpy()
         return shares
 
     def _slopes(self, *truths: Cortex) -> Tensor:
-        """Return minus the derivative of a sum of the totals, to the power of `SHARPNESS`.
+        """Return minus the derivative of a power sum of the totals, of exponent `SHARPNESS`.
 
-        By the logarithm of each pixel's samples, (H, W), in units of the whole, not negative; the
-        mean over the images. In single precision.
+        It is by the logarithm of each pixel's samples, (H, W), not negative, normalized to a sum of
+        1 and averaged over the images, in single precision.
         """
         batch = truths[0].each(lambda *planes: torch.cat(planes).float(), *truths[1:])
         logarithm = torch.zeros(len(truths), 1, *self.size, requires_grad=True)
@@ -223,22 +224,22 @@ class Model:
     ) -> NDArray[np.float64]:
         """Return the largest difference in each of ``draws`` simulated pairs of images, JND.
 
-        The details of the truth are taken as the current ones, shrunk by the share of noise in them
-        and among their neighbours; noise with the estimated covariance makes the image from them,
-        which the eye sees adapted to both alike.
-        In single precision, for differences are known to some percent. A quarter of them, on the
-        plain image, correct the boundary images; see `_correct`.
+        The true details are taken to be the current ones, shrunk by the share of noise in them and
+        among their neighbours. Noise of the estimated covariance is added to them to make the other
+        image, and the eye is adapted to both alike. It is computed in single precision, because
+        differences are known to some percent. A quarter of the draws, on the plain image, correct
+        the boundary images; see `_correct`.
 
         Parameters
         ----------
         draws
-            None: as many as the size asks for.
+            None: a number that depends on the size.
         tolerance
-            In JND. Where a quarter of the draws lie over it on average, the rest is left out: it
-            is not the end, and only then the prediction must be good.
+            In JND. Where a quarter of the draws lie above it on average, the rest is skipped: the
+            run does not end yet, and only at the end must the prediction be good.
         """
         factor = _factor(torch.from_numpy(self.single / self.count))
-        # From normal numbers to S, M, L at once.
+        # From normal deviates directly to S, M, L.
         mixing = torch.einsum("ij,jkhw->ikhw", self.to_cones, factor).float()
         generator = torch.Generator().manual_seed(0)
         height, width = self.size
@@ -258,7 +259,7 @@ class Model:
             normal = torch.randn(batch, 3, height, width, generator=generator, dtype=torch.float32)
             noise = mix(mixing, normal)
             added = self.metric.transform.decompose(noise, true_means=self.true_means)
-            # Samples are placed by the plain image, of which a quarter of the draws tells enough.
+            # Samples are placed by the plain image, for which a quarter of the draws is enough.
             if len(largest) < few:
                 visible.append(plain(added))
             totals = likely(added)
@@ -271,14 +272,16 @@ class Model:
     def largest_without(self, part: Statistics) -> float:
         """Return the visible difference that leaving out a part of the light makes, JND.
 
-        Exceeded in few runs, as `predicted_maximum` is. What is left out is simulated: the mean of
-        its samples, with noise of the estimated covariance of that mean once more, which is in the
-        mean already; it is taken off the image as plain as it may be, which hides least.
+        The true one exceeds it in few runs, as with `predicted_maximum`. What is left out is
+        simulated as the mean of its samples, plus noise of that mean's estimated covariance, which
+        the mean already has once. It is subtracted from the image as plain as it may be, which
+        masks least.
 
         Parameters
         ----------
         part
-            Of the part of each sample that is left out, as many samples as ``statistics`` has.
+            Statistics of the part of each sample that is left out, of as many samples as
+            ``statistics`` has.
         """
         factor = _factor(torch.from_numpy(pooled_covariance(part, self.size) / self.count))
         mixing = torch.einsum("ij,jkhw->ikhw", self.to_cones, factor).float()
@@ -296,7 +299,7 @@ class Model:
         return _upper(largest)
 
     def _judge(self, truth: Cortex) -> Callable[[Cortex], Tensor]:
-        """Return what finds the totals, (B, 1, h, w), that noises add to an image."""
+        """Return a function that gives the totals, (B, 1, h, w), of noises added to an image."""
         first = truth.each(Tensor.float)
         compare = self.metric.beside(first)
 
@@ -309,10 +312,10 @@ class Model:
     def _correct(self, visible: Tensor) -> None:
         """Make the boundary images agree with the simulated ones on where the error is.
 
-        How far a quartile of every detail is from the difference that noise makes depends on what
-        there is to be masked, and on colour: on a plain wall beside a chequered floor it was found
-        half as far. So each node's total is corrected by the mean over its surroundings of the
-        simulated totals over that of its own.
+        How the difference of a quartile of every detail relates to that of noise depends on masking
+        and on colour: on a plain wall next to a chequered floor it was found half as large. So each
+        node's total is multiplied by a ratio of means over its surroundings: that of the simulated
+        totals over that of the boundary images' totals.
         """
         self.correction = None
         totals = self.totals()
@@ -327,14 +330,14 @@ class Model:
     def predicted_maximum(self, tolerance: float = math.inf) -> float:
         """Return the visible difference that the true one exceeds in few runs, JND.
 
-        Less exactly where it is over ``tolerance``; see `simulated`.
+        It is less exact above ``tolerance``; see `simulated`.
         """
         return _upper(self.simulated(tolerance=tolerance))
 
     def _cone_variance(self) -> Tensor:
         """Return the variance of a single sample of each pixel in S, M, L, (1, 3, H, W).
 
-        At most `LARGEST`.
+        It is clamped to `LARGEST`.
         """
         # The diagonal of M C M^T.
         matrix = self.to_cones.numpy()
@@ -344,7 +347,7 @@ class Model:
 
 
 def _upper(largest: NDArray[np.float64]) -> float:
-    """Return what the largest difference exceeds in few runs, from simulated ones."""
+    """Return a bound that the largest difference exceeds in few runs, from simulated ones."""
     mean = float(largest.mean())
     return mean + QUANTILE * math.hypot(float(largest.std(ddof=1)), INEXACT * mean)
 
@@ -363,10 +366,10 @@ def _to_cones(metric: VDM) -> Tensor:
 
 
 def _shrunk(detail: Tensor, variance: Tensor, doubt: float) -> Tensor:
-    """Return the details less the noise in them, d max(0, 1 - V / d^2), twice over.
+    """Return the details less the noise in them, d max(0, 1 - V / d^2), by two tests.
 
-    With d^2 its mean over 3x3 nodes, which finds a texture; beside an edge that mean leaves the
-    noise as it is, so the detail by itself must pass too, and pass ``doubt`` variances.
+    One takes V and d^2 as means over 3x3 nodes, which detects a texture. Next to an edge that mean
+    would keep the noise, so the detail by itself must pass too, against ``doubt`` variances.
     """
     power = detail * detail
     share = torch.maximum(
@@ -376,12 +379,12 @@ def _shrunk(detail: Tensor, variance: Tensor, doubt: float) -> Tensor:
 
 
 def _textured(detail: Tensor, variance: Tensor) -> Tensor:
-    """Return the details as large as they probably are, where their neighbours show a texture.
+    """Return the details at their likely size, where their neighbours show a texture.
 
-    The root mean square of a normal detail given what was seen of it, never under `_shrunk`. How
-    large details are here is the least of what the four squares of 2x2 nodes around a node say,
-    less noise, all orientations together: the least, for a plain node beside an edge is no
-    texture, and without the node itself, for noise is not to mask itself.
+    It is the root mean square of a normal detail given its observed value, never under `_shrunk`.
+    The prior variance is the least mean over the four squares of 2x2 nodes around a node, less
+    noise, all orientations together: the least, because a plain node next to an edge is no
+    texture, and without the node itself, because noise must not mask itself.
     """
     power = detail * detail
     prior = _least(power - variance).clamp_min(0.0)
@@ -393,15 +396,15 @@ def _textured(detail: Tensor, variance: Tensor) -> Tensor:
 
 
 def _least(energy: Tensor) -> Tensor:
-    """Return the least mean of a node's 2x2 squares without itself, (B, C, 1, h, w).
+    """Return the least mean over a node's 2x2 squares without itself, (B, C, 1, h, w).
 
-    Of (B, C, 3, h, w), and over the three orientations; 0 for a node that is alone.
+    ``energy``, (B, C, 3, h, w), is averaged over the orientations; a node that is alone gives 0.
     """
     plane = energy.mean(2)
     size = (plane.shape[-2], plane.shape[-1])
 
     def squares(nodes: Tensor) -> Tensor:
-        """Return the sums of all 2x2 squares that have a node."""
+        """Return the sums over all 2x2 squares that contain a node."""
         return functional.avg_pool2d(functional.pad(nodes, (1, 1, 1, 1)), 2, 1) * 4.0
 
     sums, counts = squares(plane), squares(torch.ones_like(plane[:1, :1])) - 1.0
@@ -422,13 +425,13 @@ def _around(plane: Tensor) -> Tensor:
 
 
 def _factor(covariance: Tensor) -> Tensor:
-    """Return the Cholesky factor of (6, H, W), as (3, 3, H, W); of a singular one too."""
+    """Return the Cholesky factor of (6, H, W), which may be singular, as (3, 3, H, W)."""
     rr, rg, rb, gg, gb, bb = covariance
     a = rr.clamp_min(0.0).sqrt()
     over_a = torch.where(a > 0.0, 1.0 / torch.where(a > 0.0, a, 1.0), 0.0)
     b, c = rg * over_a, rb * over_a
     d = (gg - b * b).clamp_min(0.0).sqrt()
-    # A remainder that is only rounding would be divided by.
+    # Not where that would divide by a remainder that is only rounding.
     over_d = torch.where(d * d > 1e-12 * gg, 1.0 / torch.where(d > 0.0, d, 1.0), 0.0)
     e = (gb - b * c) * over_d
     f = (bb - c * c - e * e).clamp_min(0.0).sqrt()

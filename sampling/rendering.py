@@ -1,6 +1,6 @@
 """A scene rendered until nobody can see what is still missing: one run, from scene to picture.
 
-What `sampling.render` does, and ``vdm-render`` with it.
+`sampling.render` does this, and so does ``vdm-render``.
 """
 
 import contextlib
@@ -33,25 +33,26 @@ Plane = NDArray[np.float64]
 # Seconds between two checkpoints. Status: choice.
 CHECKPOINT_SECONDS = 30.0
 
-# Samples between two looks at the clock: at first, and then as many as take about so long. Neither
-# changes a bit of the image. Status: choice; a call has to be large to be fast.
+# Samples between two looks at the clock: the first number, then as many as take about so many
+# seconds, within limits. None changes a bit of the image. Status: choice; a call has to be large
+# to be fast.
 FIRST_PART, SMALLEST_PART, LARGEST_PART = 2**16, 2**12, 2**20
 PART_SECONDS = 0.5
 
-# Pixels below which the metric runs on one thread: more would gain little, and where the cores are
-# busy they wait for each other. Status: choice; measured at 96 x 64 on two busy cores, two threads
-# took 10 s for what one does in 0.7 s.
+# Pixels below which the metric runs on one thread: more threads would gain little, and on busy
+# cores they wait for each other. Status: choice; measured at 96 x 64 on two busy cores, where two
+# threads took 10 s for what one does in 0.7 s.
 FEW_PIXELS = 2**18
 
 # Seconds between two changes of the live line.
 LINE_SECONDS = 0.2
 
-# What `effects` may be.
+# The values of `effects`.
 EFFECTS = (AUTO, FULL)
 
 
 class Watch:
-    """Who is told of a run while it goes on, and may end it; by itself nobody."""
+    """Follows a run while it goes on, and may end it; this base class does nothing."""
 
     def begin(self) -> None:
         """Take note that the scene is loaded and rendering begins."""
@@ -74,7 +75,7 @@ class Result:
     image: Plane
     """(H, W, 3), linear BT.709. Filters with negative lobes may go below 0."""
     samples: NDArray[np.int64]
-    """(H, W), how many each pixel's mean is of."""
+    """(H, W), the number of samples in each pixel's mean."""
     jnd: Plane
     """(H, W), the predicted visible difference from the converged image, in JND; infinite where
     the run ended before it was predicted."""
@@ -82,26 +83,26 @@ class Result:
     """(H, W, 3), the estimated variance of ``image``."""
     aovs: dict[str, Plane]
     """(H, W) each, by name of channel: alpha (A) where the scene's film has it, and albedo, shading
-    normal and depth where they were asked."""
+    normal and depth where they were asked for."""
     report: Report | None
-    """What the last decision saw; None where the run ended before the first."""
+    """The report of the last decision; None where the run ended before the first."""
     stop_reason: str
     """tolerance, noise_threshold, max_spp, time_limit or interrupted."""
     converged: bool
     """Whether it stopped because nobody should see what is missing, in any pixel."""
     figures: dict[str, Any]
-    """What ``vdm-render --json`` says, but for what concerns its command."""
+    """The entries of ``vdm-render --json``, except those about its command."""
     header: dict[str, str]
-    """What the file says of itself beside its channels."""
+    """The entries of the file's header, besides its channels."""
     _run: "_Run" = field(repr=False)
-    """What a checkpoint is made of."""
+    """The run, from which a checkpoint is made."""
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an OpenEXR file of 32-bit floats, whole or not at all.
 
         Its channels: R, G, B, and A where the scene's film has it; samples; jnd; variance.R, .G,
-        .B; albedo.R, .G, .B, normal.X, .Y, .Z and depth.Z where they were asked. Its header names
-        the reconstruction filter, as ``pixelFilter``, and what was left out, as ``plan``.
+        .B; albedo.R, .G, .B, normal.X, .Y, .Z and depth.Z where they were asked for. Its header
+        names the reconstruction filter, as ``pixelFilter``, and what was left out, as ``plan``.
 
         Raises
         ------
@@ -127,7 +128,7 @@ class Result:
                 file.write(str(temporary))
 
     def save_checkpoint(self, path: str | os.PathLike[str]) -> None:
-        """Write what a later run goes on from with ``resume``.
+        """Write a checkpoint from which a later run continues with ``resume``.
 
         Raises
         ------
@@ -163,10 +164,10 @@ def render(
 ) -> Result:
     """Render a scene of Mitsuba until nobody can see what is still missing.
 
-    The same arguments give the same image, bit for bit; ``time_limit`` alone is outside this, and
-    for images of 2^18 pixels and more the number of threads of torch is one of the arguments: the
-    figures tell it, and a run that goes on from a checkpoint takes the number it began with.
-    Mitsuba's variant and log level are afterwards what they were, as are the numbers of threads.
+    The same arguments give the same image, bit for bit, except with ``time_limit``. For images of
+    2^18 pixels and more the number of torch threads counts as an argument: the figures report it,
+    and a run that continues from a checkpoint uses the number it began with. Mitsuba's variant and
+    log level, and the numbers of threads, are restored afterwards.
 
     Parameters
     ----------
@@ -188,14 +189,14 @@ def render(
     effects
         "auto": what nobody could see is left out, see `sampling.plan`; "full": nothing is.
     observer
-        Who judges; None: `Observer.calibrated`.
+        The observer that judges; None: `Observer.calibrated`.
     strategy, max_spp, noise_threshold, unbiased
         See `Settings`.
     time_limit
-        Seconds, scene and all; the first round is always completed. None: no limit.
+        Seconds, loading the scene included; the first round is always completed. None: no limit.
     aov
-        Whether to average albedo, shading normal and depth from the same rays; "own": what the
-        integrator gives by itself.
+        Whether to average albedo, shading normal and depth from the same rays; "own": the
+        integrator's own AOVs.
     integrator
         An `mi.Integrator` to render with in place of the scene's own; there is no checkpoint then.
     parameters, variant
@@ -203,10 +204,10 @@ def render(
     checkpoint
         A file that is written now and then, and at the end. None: none.
     resume
-        A file to go on from; where there is none yet, the run begins, with a warning.
+        A file to continue from; if there is none yet, the run starts anew, with a warning.
     watch
-        Who is told, and may end the run. Where standard error is a terminal a line on it says how
-        far it is, whoever else is told.
+        Follows the run, and may end it. If standard error is a terminal, a line on it shows the
+        progress in any case.
 
     Returns
     -------
@@ -216,11 +217,11 @@ def render(
     Raises
     ------
     ValueError
-        Of one line, if an option is out of its range, the scene cannot be rendered (`SceneError`),
-        or a checkpoint is of another run or cannot be written (`CheckpointError`).
+        With a message of one line, if an option is out of its range, the scene cannot be rendered
+        (`SceneError`), or a checkpoint is of another run or cannot be written (`CheckpointError`).
     """
     begun = time.monotonic()
-    # Those of NumPy cannot be written as JSON.
+    # NumPy numbers cannot be written as JSON.
     tolerance, ppd, white, seed = float(tolerance), float(ppd), float(white), int(seed)
     if effects not in EFFECTS:
         raise ValueError(f"expected effects among {', '.join(EFFECTS)}, got {effects!r}")
@@ -247,7 +248,7 @@ def render(
             variant=variant,
         )
         height, width = renderer.size
-        # The sampler's own state says which settings it has; the rest is said here.
+        # The sampler's own state has its settings; the rest is recorded here.
         identity = {
             **asdict(settings),
             "version": __version__,
@@ -286,7 +287,7 @@ def render(
 
 
 class _EndedError(Exception):
-    """A decision is not waited for; the run ends."""
+    """The run ends without waiting for a decision."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -294,7 +295,7 @@ class _EndedError(Exception):
 
 
 class _Clock:
-    """A renderer whose time is measured, and all other time beside it."""
+    """A renderer whose time is measured, as is all other time."""
 
     def __init__(self, renderer: MitsubaRenderer, seconds: dict[str, float]) -> None:
         self.size = renderer.size
@@ -305,7 +306,7 @@ class _Clock:
         self._drawn, self._drawing = 0, 0.0
 
     def spent(self, what: str | None) -> float:
-        """Say what the time since the last call went to; None: nothing that is told."""
+        """Charge the time since the last call to an entry, or to none, and return it."""
         now = time.perf_counter()
         passed, self._before = now - self._before, now
         if what is not None:
@@ -322,7 +323,7 @@ class _Clock:
         return samples
 
     def drew(self, samples: int) -> None:
-        """Say that the time since the last call went to so many samples."""
+        """Charge the time since the last call to so many samples."""
         self._drawing += self.spent("render")
         self._drawn += samples
         self.speed = self._drawn / self._drawing
@@ -336,7 +337,7 @@ class _Clock:
 
 @dataclass
 class _Run:
-    """A scene, its sampler, and what the run has cost, over all its interruptions."""
+    """A scene, its sampler, and the cost of the run, including earlier parts of it."""
 
     renderer: MitsubaRenderer
     sampler: Sampler
@@ -344,19 +345,19 @@ class _Run:
     begun: float
     """When this part of the run began, by the monotonic clock."""
     threads: int
-    """That the metric computes on, on which the last bits depend; a run keeps to them."""
+    """Threads of the metric, on which the last bits depend; a run keeps their number."""
     effects: str
     plan: Plan
     piloted: bool
-    """Whether a pilot is still to say more of the plan."""
+    """Whether a pilot is still to refine the plan."""
     samples: int = 0
     seconds: dict[str, float] = field(
         default_factory=lambda: dict.fromkeys(("render", "metric", "total"), 0.0)
     )
-    """Those for rays and for deciding; those of the parts before this one."""
+    """Seconds for rays and for deciding, and the total of the parts before this one."""
 
     def check_kept(self) -> None:
-        """Refuse a checkpoint of what could not be recognized."""
+        """Refuse a checkpoint of a scene that could not be recognized."""
         if not self.renderer.fingerprint:
             raise checkpoints.CheckpointError(
                 "expected a scene in a file with a checkpoint, got one of which nobody could tell "
@@ -379,7 +380,7 @@ class _Run:
         checkpoints.save(path, checkpoints.Checkpoint(self.identity, state))
 
     def go_on(self, path: Path) -> None:
-        """Begin where a checkpoint ends, or anew where there is none yet: the same image."""
+        """Continue from a checkpoint, or start anew if there is none yet: the image is the same."""
         if not path.exists():
             warnings.warn(f"{path}: no checkpoint yet; starting from the beginning", stacklevel=3)
             return
@@ -406,10 +407,10 @@ class _Run:
             ) from error
 
     def _take_over(self, path: Path, begun: dict[str, Any]) -> None:
-        """Take over the plan of a checkpoint, or refuse it where another one would be made."""
+        """Adopt the plan of a checkpoint, or refuse it where another one would be made."""
         plan = Plan.restored(begun["plan"])
         if begun["effects"] != self.effects:
-            # What has been kept whole so far may be so further on.
+            # A run that has kept everything so far may continue to do so.
             if plan.integrator is not None or self.plan.integrator is not None:
                 raise checkpoints.CheckpointError(
                     f"{path}: begun with --effects {begun['effects']}, and this is {self.effects}; "
@@ -423,14 +424,14 @@ class _Run:
         self.piloted = False
 
     def report(self) -> Report | None:
-        """Return what the last decision saw, and what is left out with it."""
+        """Return the last decision's report, with the bound on what is left out added."""
         report, bound = self.sampler.report(), self.plan.bound
         if report is None or not bound:
             return report
         return report._replace(predicted=report.predicted + bound, jnd=report.jnd + bound)
 
     def _draw_pilot(self, watch: Watch, clock: _Clock, look: Callable[[], None]) -> Pilot:
-        """Draw the first round, in which more is told of each sample than its light."""
+        """Draw the first round, which records more of each sample than its light."""
         pilot = Pilot(self.plan, self.renderer, self.sampler)
         clock.spent("metric")
         for part in pilot.steps():
@@ -441,7 +442,7 @@ class _Run:
         return pilot
 
     def _settle(self, pilot: Pilot, report: Report) -> None:
-        """Take over what the pilot says of the plan, unless the run ends with it."""
+        """Adopt the pilot's plan and sampler, unless the run ends with its round."""
         self.piloted = False
         if report.stop_reason is not None:
             self.plan = self.plan.ended()
@@ -457,7 +458,7 @@ class _Run:
         clock = _Clock(self.renderer, self.seconds)
 
         def look() -> None:
-            """End the run where no more is to be done at all."""
+            """End the run at once where nothing more is to be done."""
             if watch.presses() > 1:
                 raise _EndedError("interrupted")
             # The first round is always completed: without it there is no image, and no prediction.
@@ -485,7 +486,7 @@ class _Run:
                     if pilot is not None and self.piloted:
                         self._settle(pilot, report)
                         if report.stop_reason is None:
-                            break  # from here on by another sampler, where something is left out
+                            break  # continue with another sampler where something is left out
                     watch.round(self.report())
                     if report.stop_reason is not None:
                         return report.stop_reason
@@ -563,7 +564,7 @@ class _Run:
 
 @contextlib.contextmanager
 def _threads(count: int) -> Iterator[None]:
-    """Have torch compute on so many threads."""
+    """Run torch on so many threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -581,7 +582,7 @@ def terminal() -> Any:
 
 @contextlib.contextmanager
 def _told(watch: Watch, tolerance: float) -> Iterator[Watch]:
-    """Show a live line on a terminal, beside who else is told."""
+    """Show a live line on a terminal, in addition to the given watch."""
     from rich.live import Live
 
     console = terminal()
@@ -593,7 +594,7 @@ def _told(watch: Watch, tolerance: float) -> Iterator[Watch]:
 
 
 class _LiveLine(Watch):
-    """One line that changes."""
+    """One line that is redrawn in place."""
 
     def __init__(self, live: Any, tolerance: float, beside: Watch) -> None:
         self._live, self._tolerance, self._beside = live, tolerance, beside
@@ -631,7 +632,7 @@ class _LiveLine(Watch):
 
 
 def seen(report: Report, tolerance: float) -> list[str]:
-    """Return in words what a round's decision saw."""
+    """Return in words what a round's decision predicted."""
     return [
         f"predicted maximum {report.predicted:.3g} JND",
         f"{100.0 * report.over:.3g} % over {tolerance:g}",

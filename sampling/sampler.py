@@ -1,4 +1,4 @@
-"""The adaptive sampler: ask what to render, tell what came, in rounds (Fig. 8).
+"""The adaptive sampler: ask what to render, tell the results, in rounds (Fig. 8).
 
 It draws nothing itself and knows no renderer. `rounds` is the loop that joins the two.
 """
@@ -25,15 +25,15 @@ Plane = NDArray[np.float64]
 StopReason = Literal["tolerance", "noise_threshold", "max_spp"]
 StrategyName = Literal["perceptual", "objective", "uniform", "halfbuffer"]
 
-# What `state` is made of. Raised when an older state would be continued differently.
+# Version of `state`, raised when an older state would be continued differently.
 STATE_VERSION = 8
 
-# Share of the tolerance that a round aims at, for a prediction is not exact. Status: choice.
+# Share of the tolerance that a round aims at, since a prediction is not exact. Status: choice.
 AIM = 0.98
 
-# An image in which no sample has met any light may have missed it all. It is not finished before a
-# pixel has so many samples, which grow by this factor a round. Status: choice; a light of 1 in 1000
-# on four pixels of a black image then stays unseen in one run of ten million.
+# An image in which no sample has hit any light may have missed all of it. It is not finished before
+# a pixel has so many samples, which grow by this factor per round. Status: choice; a light that 1
+# sample in 1000 hits, on four pixels of a black image, is then missed in one run of ten million.
 UNLIT, UNLIT_GROWTH = 4096, 4.0
 
 
@@ -55,7 +55,7 @@ class Settings:
         The half-buffer's own stop, in the unit of its error; None: stop on ``tolerance``.
     unbiased
         Decide on one set of samples and show another: when the run would stop, the same numbers
-        of samples are drawn anew, and only these make the image.
+        of samples are drawn again, and the image is made of these only.
 
     Raises
     ------
@@ -104,15 +104,14 @@ class Request:
 
     @property
     def samples(self) -> int:
-        """How many samples that is."""
+        """The number of samples in total."""
         return int(self.count.sum())
 
     def parts(self, at_once: int) -> Iterator["Request"]:
         """Yield the request in parts of at most about ``at_once`` samples, in order.
 
         A pixel's run is cut only at multiples of `PIECE`, as `Statistics` cuts it, so that the
-        size of a batch leaves no trace in the bits of the result. A part may thus be as large as
-        `PIECE`.
+        size of a batch does not change a bit of the result. A part may thus be as large as `PIECE`.
         """
         # Where each run is cut: at every multiple of PIECE inside it.
         pieces = (self.first + self.count - 1) // PIECE - self.first // PIECE + 1
@@ -128,7 +127,7 @@ class Request:
             drawn = ends[start - 1] if start else 0
             stop = max(start + 1, int(np.searchsorted(ends, drawn + at_once, side="right")))
             part = slice(start, stop)
-            # Pieces of one run that fall into one part are one run of it.
+            # Pieces of one run that fall into the same part are joined again.
             head = np.flatnonzero(np.diff(of[part], prepend=-1))
             count = np.add.reduceat((high - low)[part], head)
             yield Request(self.pixels[of[part][head]], low[part][head], count)
@@ -143,15 +142,15 @@ class Report(NamedTuple):
     samples: int
     """Samples drawn so far."""
     spp: float
-    """The same, a pixel."""
+    """The same, per pixel."""
     predicted: float
-    """Largest visible difference from the converged image, in JND: not exceeded with 95 %."""
+    """Largest visible difference from the converged image, in JND: at 95 % confidence."""
     over: float
-    """Share of pixels that are predicted over the tolerance, 0 to 1."""
+    """Share of pixels that are predicted to be over the tolerance, 0 to 1."""
     jnd: NDArray[np.float64]
     """(H, W), the predicted map, in JND; its maximum is ``predicted``."""
     forecast: int
-    """Samples that the model expects to be still needed; 0 when stopped."""
+    """Samples that the model expects still to be needed; 0 when stopped."""
     nonfinite: int
     """Samples that were NaN or infinite, and are not in the image."""
     stop_reason: StopReason | None
@@ -166,18 +165,18 @@ class Report(NamedTuple):
 class Sampler:
     """Decides where samples go and when there are enough.
 
-    ``ask`` gives what to draw next, the same until all of it has been told, and None once it has
-    stopped. ``tell`` folds samples in. All decisions fall in ``ask``; they depend on the samples
-    and settings alone, not on batches.
+    ``ask`` returns what to draw next, the same until ``tell`` has received all of it, and None once
+    the run has stopped. ``tell`` folds samples in. All decisions are made in ``ask``; they depend
+    on the samples and settings alone, not on batches.
 
     Parameters
     ----------
     size
         Height and width in pixels.
     metric
-        Who judges; its display must be linear, or XYZ, and its transform `Haar`.
+        The metric that judges; its display must be linear, or XYZ, and its transform `Haar`.
     settings
-        What the user chose.
+        The user's choices.
 
     Raises
     ------
@@ -206,15 +205,15 @@ class Sampler:
         self._statistics = Statistics(self.size[0] * self.size[1], self._strategy.halves)
         self._target = np.full(self.size[0] * self.size[1], self._pilot(), np.int64)
         self._rounds = 0
-        # Of an unbiased run, once it has decided: why it stopped.
+        # Why an unbiased run stopped, once it has decided.
         self._decided: StopReason | None = None
         self._report: Report | None = None
 
     def ask(self, look: Callable[[], None] = lambda: None) -> Request | None:
         """Return what is left to draw of this round, or the next round, or None when stopped.
 
-        ``look`` is called now and then while it decides. What it raises ends the decision, of which
-        nothing is left: the next ``ask`` takes it anew.
+        ``look`` is called now and then during a decision. What it raises ends the decision without
+        a trace: the next ``ask`` starts it again.
         """
         if self._report is not None and self._report.stop_reason is not None:
             return None
@@ -228,7 +227,7 @@ class Sampler:
         return Request(pixels, (statistics.first + statistics.drawn)[pixels], left[pixels])
 
     def tell(self, samples: Samples) -> None:
-        """Fold in samples: the parts of what was asked, in order.
+        """Fold in samples: the parts of what was asked for, in order.
 
         Raises
         ------
@@ -245,13 +244,13 @@ class Sampler:
         self._statistics.add(samples)
 
     def report(self) -> Report | None:
-        """Return what the last decision saw; None before the pilot is complete."""
+        """Return the report of the last decision; None before the pilot is complete."""
         return self._report
 
     def largest_without(self, part: Statistics) -> float:
         """Return the visible difference that leaving out a part of the light makes, JND.
 
-        ``part`` is what is left out of each sample so far; see `Model.largest_without`.
+        ``part`` has what is left out of each sample so far; see `Model.largest_without`.
         """
         return Model(self.metric, self._statistics, self.size).largest_without(part)
 
@@ -262,7 +261,7 @@ class Sampler:
 
     @property
     def count(self) -> NDArray[np.int64]:
-        """(H, W), how many samples the image is made of."""
+        """(H, W), how many samples each pixel of the image is made of."""
         return self._statistics.count.reshape(self.size)
 
     @property
@@ -273,9 +272,9 @@ class Sampler:
         return variance
 
     def state(self) -> dict[str, Any]:
-        """Return everything that a continuation needs: arrays, numbers, strings, None, flat.
+        """Return all that a continuation needs: a flat dict of arrays, numbers, strings and None.
 
-        `restore` continues bit for bit, wherever in a round it was taken.
+        `restore` continues bit for bit, wherever in a round the state was taken.
         """
         report = self._report._asdict() if self._report is not None else {}
         return {
@@ -327,15 +326,15 @@ class Sampler:
     @torch.inference_mode(False)
     @torch.enable_grad()
     def _decide(self, look: Callable[[], None]) -> None:
-        """End a round: predict, then stop, or say how many samples every pixel is to have.
+        """End a round: predict, then stop, or set how many samples every pixel is to have.
 
-        Placement takes derivatives, whatever the caller has switched off.
+        Placement needs derivatives, even if the caller has switched them off.
         """
         statistics = self._statistics
         model = Model(self.metric, statistics, self.size, look)
         predicted = model.predicted_maximum(self.settings.tolerance)
         totals = model.totals()
-        # The boundary images say where, the simulation how much.
+        # The boundary images say where the difference is, the simulation how large.
         shares = totals / totals.amax().clamp_min(1e-300)
         pixels = push(shares, self.size, before=model.cortex.grid.before(0))[0, 0].numpy()
         jnd = predicted * pixels ** (1.0 / model.exponent)
@@ -358,7 +357,7 @@ class Sampler:
         if self.settings.unbiased:
             shown = self._decided is not None
             if reason is not None and not shown:
-                # The same numbers of samples once more, on which nothing has been decided.
+                # The same numbers of samples are drawn again: no decision depended on these.
                 self._decided, reason = reason, None
                 self._target = statistics.drawn.copy()
                 self._statistics = Statistics(
@@ -407,7 +406,7 @@ class Sampler:
         goal = (AIM * self.settings.tolerance / predicted) ** model.exponent * model.largest()
         wanted = self._strategy.wanted(model, self._statistics, goal)
         if not (wanted > model.count).any():
-            # The boundary images see nothing where the simulation does.
+            # The boundary images show nothing where the simulation does.
             wanted = 2.0 * model.count
         return wanted
 
@@ -425,13 +424,13 @@ def rounds(
     Parameters
     ----------
     sampler, renderer
-        Who decides, and who draws.
+        The sampler decides, the renderer draws.
     at_once
-        Samples asked of the renderer in one call, or what gives them for each round. It changes
-        memory and speed, no bit of the result.
+        Samples per call of the renderer, or a function that returns them for each round. It changes
+        memory and speed, but no bit of the result.
     look
         Called after each call of the renderer, and now and then within a decision. What it raises
-        ends the rounds where they are, and begun anew they go on from there.
+        ends the rounds where they are; started again, they continue from there.
     told
         Called with the number of samples that have just been folded in, before ``look``.
     """

@@ -1,7 +1,7 @@
-"""What is kept of the samples: count, mean and co-moments of every pixel, in bounded memory.
+"""Statistics of the samples: count, mean and co-moments of every pixel, in bounded memory.
 
-The leaves of the paper's tree ("refine cortex representation", Fig. 8). Partial statistics are
-merged by the pairwise rule of Chan, Golub and LeVeque 1979, its third and fourth moments after
+They are the leaves of the paper's tree ("refine cortex representation", Fig. 8). Partial statistics
+are merged by the pairwise rule of Chan, Golub and LeVeque 1979, third and fourth moments after
 Pebay 2008.
 """
 
@@ -14,11 +14,11 @@ from sampling.renderers import Samples
 
 Plane = NDArray[np.float64]
 
-# Rows and columns of the six co-moments that are kept of the symmetric 3x3 matrix.
+# Rows and columns of the six co-moments that are kept from the symmetric 3x3 matrix.
 FIRST, SECOND = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 
 # A run of samples of one pixel is folded in at once, but never across a sample number that is a
-# multiple of this. So long as a run is not cut elsewhere, the batch leaves no trace in the bits.
+# multiple of this. As long as a run is not cut elsewhere, the batch does not change a bit.
 PIECE = 2**16
 
 # Samples, and runs of them, that are folded in at once, which bounds memory. Status: choice,
@@ -29,13 +29,13 @@ AT_ONCE, RUNS_AT_ONCE = 2**17, 2**13
 class Statistics:
     """Count, RGB mean and co-moments of the samples of each of ``pixels`` pixels, in float64.
 
-    Merging, in whatever order, changes nothing but the last bits. A sample that is NaN or
-    infinite in any channel is drawn and counted in ``nonfinite``, and is nowhere else.
+    The order of merging changes only the last bits. A sample that is NaN or infinite in any channel
+    is counted in ``drawn`` and ``nonfinite``, and nowhere else.
 
     Attributes
     ----------
     first
-        (P,), int64: the number of the first sample that is drawn.
+        (P,), int64: the number of the first sample to be drawn.
     drawn, nonfinite
         (P,), int64: samples drawn, and how many of them were not finite.
     mean
@@ -45,7 +45,7 @@ class Statistics:
     higher
         (2, P), sums of the third and fourth power of the distance from the mean of (R + G + B) / 3.
     half_count, half_mean
-        (P,) and (3, P): count and mean of the samples of even number; None where not asked for.
+        (P,) and (3, P): count and mean of the even-numbered samples; None where not asked for.
     """
 
     def __init__(
@@ -62,16 +62,16 @@ class Statistics:
 
     @property
     def count(self) -> NDArray[np.int64]:
-        """(P,), how many samples the mean is made of."""
+        """(P,), the number of samples in the mean."""
         return self.drawn - self.nonfinite
 
     def add(self, samples: Samples) -> None:
-        """Fold in the next samples of some pixels; sample numbers go on where they ended.
+        """Fold in the next samples of some pixels; sample numbers continue where they ended.
 
         Raises
         ------
         ValueError
-            Where shapes or pixel numbers are not as the protocol says.
+            Where shapes or pixel numbers do not follow the protocol.
         """
         pixels, radiance = samples
         if radiance.shape != (len(pixels), 3):
@@ -87,8 +87,8 @@ class Statistics:
         if len(cuts) > 0:
             starts = np.union1d(starts, cuts)
             lengths = np.diff(starts, append=len(pixels))
-        # Whole runs at a time, so many that a call costs less than its numbers, and never two
-        # pieces of one run.
+        # Whole runs at a time, enough to outweigh the overhead of a call, and never two pieces of
+        # one run.
         ends = starts + lengths
         low = 0
         while low < len(starts):
@@ -130,7 +130,7 @@ class Statistics:
         self.nonfinite += other.nonfinite
 
     def covariance(self) -> Plane:
-        """Return the covariance of single samples, (6, P), without bias; 0 below two samples."""
+        """Return the unbiased covariance of single samples, (6, P); 0 below two samples."""
         return self.comoments / np.maximum(self.count - 1, 1)
 
     def state(self) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]:
@@ -148,7 +148,7 @@ class Statistics:
     def _cuts(
         self, runs: NDArray[np.int64], starts: NDArray[np.int64], lengths: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Return where in the samples a run goes on at a multiple of `PIECE`."""
+        """Return where in the samples a run crosses a multiple of `PIECE`."""
         number = self.first[runs] + self.drawn[runs]
         inside = (number + lengths - 1) // PIECE - number // PIECE
         of = np.repeat(np.arange(len(runs)), inside)
@@ -163,9 +163,9 @@ class Statistics:
         starts: NDArray[np.int64],
         lengths: NDArray[np.int64],
     ) -> None:
-        """Fold in whole runs, of which it is known where they start and how long they are."""
+        """Fold in whole runs, given their starts and lengths."""
         runs = pixels[starts]
-        # Of all numbers at once: which samples are meant is asked only where one is not finite.
+        # All values are checked at once: single samples only where some value is not finite.
         every = bool(np.isfinite(radiance).all())
         finite = np.ones(1, np.bool_) if every else np.isfinite(radiance).all(1)
         if self.half_count is not None:
@@ -182,7 +182,7 @@ class Statistics:
             before = before[kept]
             starts, lengths = _runs(pixels)
             runs = pixels[starts]
-        # Neighbours are reached much faster as a slice.
+        # Adjacent pixels are accessed much faster as a slice.
         beside = runs[-1] - runs[0] == len(runs) - 1
         where = slice(int(runs[0]), int(runs[-1]) + 1) if beside else runs
         self._fold(where, before, *_reduce(radiance, starts, lengths))
@@ -190,7 +190,7 @@ class Statistics:
     def _add_halves(
         self, pixels: NDArray[np.int64], radiance: NDArray[np.float32], kept: NDArray[np.bool_]
     ) -> None:
-        """Fold in the samples of even number."""
+        """Fold in the even-numbered samples."""
         if self.half_count is None or self.half_mean is None or not kept.any():
             return
         pixels, radiance = pixels[kept], radiance[kept]
@@ -247,7 +247,7 @@ def scalar_second(comoments: Plane) -> Plane:
 
 
 def _scalar(colour: Plane) -> Plane:
-    """Return (R + G + B) / 3 of (3, ...). No matrix product: its bits depend on the length."""
+    """Return (R + G + B) / 3 of (3, ...): the bits of a matrix product depend on the length."""
     scalar: Plane = (colour[0] + colour[1] + colour[2]) / 3.0
     return scalar
 
@@ -257,8 +257,8 @@ def _reduce(
 ) -> tuple[Plane, Plane, Plane, Plane]:
     """Return count, mean, co-moments and higher moments of each run of samples.
 
-    About the run's first sample, so that a constant pixel has exactly no variance and a bright
-    one loses no digits; the differences of single-precision numbers are exact.
+    They are taken about the run's first sample, so that a constant pixel has exactly zero variance
+    and a bright one loses no digits; the differences of single-precision numbers are exact.
     """
     shifted: Plane = radiance.T.astype(np.float64, order="C")
     count = lengths.astype(np.float64)

@@ -1,7 +1,7 @@
 """Where the next samples go ("determine next sample location", Fig. 8).
 
-Four strategies under one contract. Each says how many samples every pixel should have by the end
-of the next round, so that the model itself predicts the tolerance; none decides when to stop.
+There are four strategies with one interface. Each says how many samples every pixel should have by
+the end of the next round for the model to predict the tolerance; none decides when to stop.
 """
 
 import math
@@ -24,15 +24,16 @@ LARGEST_GROWTH = 64.0
 # A round multiplies the samples of a pixel that it selects by no less. Status: choice.
 SMALLEST_GROWTH = 1.05
 
-# The logarithm of the growth is found so well, or so well that the logarithm of the prediction lies
-# less than so much below the goal's: 1.6 % of the samples, 0.4 % of the JND. Status: choice.
+# The search ends when the logarithm of the growth is known this well, or that of the prediction is
+# less than this below the goal's: 1.6 % of the samples, 0.4 % of the JND. Status: choice.
 CLOSE, CLOSE_BELOW = 0.016, 0.004
 
-# Where the search begins: differences fall by the root of the samples. Status: choice.
+# The power of the samples with which the search begins: differences fall by the root. Status:
+# choice.
 FALLING = 0.5
 
-# It goes on as if they fell by no smaller power, for as a rule they fall faster once all pixels of
-# a largest one grow. Status: choice, measured.
+# The smallest power that the search then assumes, since differences usually fall faster once all
+# pixels of a largest one grow. Status: choice, measured.
 SLOWEST = 0.125
 
 
@@ -49,22 +50,22 @@ class Strategy(Protocol):
         Parameters
         ----------
         model
-            Of the samples so far.
+            The model of the samples so far.
         statistics
             The samples so far.
         goal
-            What is wanted to stand for the largest total error of the boundary images, in JND to
-            the power of the summation; see `Model.largest`.
+            The value wanted of `Model.largest`, which stands for the largest total error of the
+            boundary images, in JND to the power of the summation exponent.
         """
 
 
 class Perceptual:
     """The paper's: more samples below the nodes whose total is over the tolerance.
 
-    A total over the tolerance is the sum of errors down a path, of neighbours too by pooling, so
-    that it is traced back to the pixels whose noise it is made of. Where every pixel's samples are
-    in proportion to its share, no other distribution of as many does better; a round goes there
-    half way in the logarithm, for the shares of what it improves will fall.
+    A total over the tolerance is the sum of errors down a path and, by pooling, of neighbours, so
+    it is traced back to the pixels whose noise causes it. Where every pixel's samples are in
+    proportion to its share, no other distribution of as many samples does better. A round goes half
+    way there in the logarithm, because the shares of what it improves will fall.
     """
 
     halves = False
@@ -106,22 +107,22 @@ class Uniform(_Levelled):
 class Objective(_Levelled):
     """The paper's Eq. 6: the variance of the mean, summed over R, G, B.
 
-    Its detail coefficients have a quarter of their pixels' variance whatever the orientation, so
-    that the largest local error lies where the variance is largest.
+    The detail coefficients have a quarter of their pixels' variance in every orientation, so the
+    largest local error lies where the variance is largest.
     """
 
     def error(self, model: Model, statistics: Statistics) -> Plane:
-        """Return s^2 / n, with the shrunk variance: seen by itself, none is 0 for ever."""
+        """Return s^2 / n with the shrunk variance: a pixel's own, once 0, would stay 0."""
         del statistics
         error: Plane = (model.single[0] + model.single[3] + model.single[5]) / model.count
         return error
 
 
 class HalfBuffer(_Levelled):
-    """What Cycles and OpenMoonRay do: the image beside the image of every second sample.
+    """What Cycles and OpenMoonRay do: the image against the image of every second sample.
 
-    sum abs(I - I_half) / sqrt(sum I), the largest within 3x3 pixels; squared it falls as one over
-    the samples.
+    The error is sum abs(I - I_half) / sqrt(sum I), its maximum over 3x3 pixels; its square falls as
+    one over the samples.
     """
 
     halves = True
@@ -154,7 +155,7 @@ STRATEGIES: dict[str, Strategy] = {
 
 
 def _grown(model: Model, worth: Plane, growth: float) -> Plane:
-    """Return the samples of every pixel, (H, W), where the worthiest grow by exp(growth)."""
+    """Return the samples of every pixel, (H, W), those of largest worth times exp(growth)."""
     count: Plane = model.count * np.maximum(worth * np.exp(growth), 1.0)
     return count
 
@@ -162,20 +163,20 @@ def _grown(model: Model, worth: Plane, growth: float) -> Plane:
 def _growth(model: Model, worth: Plane, goal: float) -> float:
     """Return about the smallest logarithm of the growth at which the model predicts the goal.
 
-    Between `SMALLEST_GROWTH` and `LARGEST_GROWTH`. The totals fall as samples grow: their
-    logarithm is interpolated between what is too little and what is enough, and where that does
-    not halve what lies between, the middle is taken.
+    It lies between `SMALLEST_GROWTH` and `LARGEST_GROWTH`. The totals fall as samples grow: their
+    logarithm is interpolated between a growth that is too small and one that is enough; where that
+    does not halve the bracket, its middle is taken.
     """
     smallest, largest = math.log(SMALLEST_GROWTH), math.log(LARGEST_GROWTH)
 
     def over(count: Plane | None) -> float:
-        """Return the logarithm of what stands for the largest difference over the goal."""
+        """Return the logarithm of the largest difference over the goal's, by `Model.largest`."""
         return math.log(max(model.largest(count) / goal, 1e-300)) / model.exponent
 
     little, above = 0.0, over(None)
     if above <= 0.0:
         return smallest
-    enough, below = largest, math.nan  # nothing is known of the largest yet
+    enough, below = largest, math.nan  # the largest growth has not been tried yet
     place = above / FALLING
     while enough - little > CLOSE:
         between, margin = enough - little, 0.0 if math.isnan(below) else 0.5 * CLOSE
@@ -184,7 +185,7 @@ def _growth(model: Model, worth: Plane, goal: float) -> float:
         if found > 0.0:
             falling = max((above - found) / (place - little), SLOWEST)
             little, above = place, found
-            # On, and a little too far, so that the next lies beyond.
+            # Forward, and a little too far, so that the next step is enough.
             place += 1.5 * found / falling
         else:
             enough, below = place, found

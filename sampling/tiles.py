@@ -1,9 +1,9 @@
 """Local errors for other numbers of samples: tiles that no change touches are not computed again.
 
 A decision asks for the errors of one image many times, and each time only the variances differ:
-the details, and what the eye is adapted to, stay. So a node's local error depends on the variances
-of its details and of its neighbours' in pooling alone. Where these are what they were, so is the
-error, bit for bit.
+the details and the adapting light stay the same. So a node's local error depends only on the
+variances of its details and, by pooling, of its neighbours' details. Where these are unchanged, so
+is the error, bit for bit.
 """
 
 from collections.abc import Sequence
@@ -18,31 +18,31 @@ from torch_vdm import VDM
 from torch_vdm.model.cortex import Cortex
 from torch_vdm.model.grid import Before
 
-# Levels of no more nodes are computed whole: there an operation costs more than its numbers.
-# Status: choice, as in `torch_vdm.vdm`.
+# Levels of at most so many nodes are computed whole: there an operation's overhead outweighs its
+# arithmetic. Status: choice, as in `torch_vdm.vdm`.
 FEW_NODES = 64 * 64
 
-# Nodes around a piece of a level that are computed with it: one for pooling, and one more, for a
-# piece begins where a parent does.
+# Nodes around a piece of a level that are computed with it: one for pooling, and one more because
+# a piece begins where a parent does.
 HALO = 2
 
-# Nodes on each side of a tile; 32 with the halo. Status: choice.
+# Nodes along the side of a tile; 32 with the halo. Status: choice.
 TILE = 28
 
-# Strips have multiples of so many rows and columns, with the halo. Vectorised loops take up to 32
-# numbers at a time and what is left over one by one, where 2^x has other last bits: of these sides,
-# and of a tile's, nothing is left over, in nodes and in their parents. Status: measured, AVX-512.
+# With its halo a strip has multiples of so many rows and columns. Vectorised loops take up to 32
+# values at a time and the remainder one by one, where 2^x has other last bits. These sides, and a
+# tile's, leave no remainder, in nodes and in their parents. Status: measured, AVX-512.
 ROWS, COLUMNS = 16, 8
 
-# Most nodes from left to right in a strip. Status: choice.
+# Largest width of a strip, in nodes. Status: choice.
 WIDEST = 508
 
-# Numbers of the pieces that are computed at once. More would be computed by other steps of the
-# metric, with other last bits. Status: choice, as in `torch_vdm.vdm`.
+# Values of the pieces that are computed at once. More would take another path through the metric,
+# with other last bits. Status: choice, as in `torch_vdm.vdm`.
 AT_ONCE = 2**18
 
-# Untouched tiles are skipped where the touched ones are at most this share of a level; else all of
-# it is computed, in strips. Status: measured, `python -m benchmarks tiles`.
+# Untouched tiles are skipped where the touched ones are at most this share of a level; otherwise
+# the whole level is computed, in strips. Status: measured, `python -m benchmarks tiles`.
 PAYS = 0.6
 
 # Row and column of a piece among the pieces of a level.
@@ -53,25 +53,25 @@ class _Cut(NamedTuple):
     """How a level is cut into pieces."""
 
     rows: int
-    """Of nodes in a piece, without the halo; even, as columns are."""
+    """Rows of nodes in a piece, without the halo; even, as columns are."""
     columns: int
     down: int
     """How many pieces there are from top to bottom."""
     across: int
 
     def places(self) -> list[Place]:
-        """Return all of them."""
+        """Return the places of all pieces."""
         return [(y, x) for y in range(self.down) for x in range(self.across)]
 
     @property
     def nodes(self) -> int:
-        """Nodes of a piece with its halo."""
+        """The number of nodes in a piece with its halo."""
         return (self.rows + 2 * HALO) * (self.columns + 2 * HALO)
 
     def around(self, plane: Tensor, places: Sequence[Place], node: int) -> Tensor:
         """Return pieces with their halo, one below the other, (..., h, w).
 
-        ``plane`` has a halo, and ``node`` nodes of the level on each side of one of its own.
+        ``plane`` has a halo, and each of its nodes spans ``node`` nodes of the level per side.
         """
         rows, columns, halo = self.rows // node, self.columns // node, 2 * HALO // node
         parts = [
@@ -82,11 +82,11 @@ class _Cut(NamedTuple):
 
 
 class _Level:
-    """A fine level of an image whose details stay, cut into tiles, or strips for all of it."""
+    """A fine level of an image with fixed details, cut into tiles, or as a whole into strips."""
 
     def __init__(self, details: Tensor, parents: Tensor, finest: int, before: Before) -> None:
         self.before = before
-        # With what is put before the first node: all pieces begin where a parent does.
+        # With the padding before the first node: all pieces begin where a parent does.
         height, width = details.shape[-2] + before[0], details.shape[-1] + before[1]
         self.size = height, width
         self.finest = finest
@@ -98,28 +98,29 @@ class _Level:
         right = max(cut.columns * cut.across for cut in (self.tiles, self.strips)) - width
         self._sides = (HALO + before[1], HALO + right, HALO + before[0], HALO + down)
         self.details = self.padded(details)
-        # Of an odd side the last parent has one node; what is put before the first has its parent.
+        # On an odd side the last parent has one node; the padding before the first has its parent.
         left, right, top, down = (side // 2 for side in self._sides)
         self.parents = functional.pad(parents, (left, right, top, down), mode="replicate")
 
     def padded(self, plane: Tensor) -> Tensor:
-        """Return a plane (1, 3, n, h, w) with its border repeated as far as pieces reach."""
+        """Return a plane (1, 3, n, h, w) with its border replicated to cover all pieces."""
         return functional.pad(plane, (*self._sides, 0, 0), mode="replicate")
 
 
 class LocalErrors:
     """The local errors of the boundary images of one image, for any variances.
 
-    In single precision, but for the mean of the image, which is known far better than a pixel.
+    They are in single precision, except the mean of the image, which is known far better than a
+    pixel.
 
     Parameters
     ----------
     metric
-        Who judges.
+        The metric that judges.
     truth
         The image, with the details that it is taken to have; (1, 3, ...).
     leaves
-        (1, 3, H, W), float32: the variances of the pixels that others are compared with.
+        (1, 3, H, W), float32: the variances of the pixels with which others are compared.
     """
 
     def __init__(self, metric: VDM, truth: Cortex, leaves: Tensor) -> None:
@@ -127,7 +128,7 @@ class LocalErrors:
         nodes = [detail.shape[-2] * detail.shape[-1] for detail in truth.details]
         few = sum(count <= FEW_NODES for count in nodes)
         details = [detail.float() for detail in truth.details]
-        # To which the eye is adapted.
+        # The light to which the eye is adapted.
         windows = [plane.float() for plane in truth.windows or truth.lowpass]
         self._coarse = Cortex(
             tuple(details[:few]),
@@ -152,10 +153,10 @@ class LocalErrors:
         ]
 
     def at(self, leaves: Tensor, pays: float = PAYS) -> tuple[Tensor, ...]:
-        """Return the local errors where pixels have these variances, (1, 3, H, W).
+        """Return the local errors, as `local_errors`, for these variances of pixels, (1, 3, H, W).
 
-        As `local_errors`. Untouched tiles are skipped where touched ones are at most the share
-        ``pays`` of a level. It changes no bit.
+        Untouched tiles are skipped where touched ones are at most the share ``pays`` of a level,
+        which changes no bit.
         """
         variances = detail_variances(leaves, self._metric.observer.true_means)
         few = len(self._coarse.details)
@@ -171,7 +172,7 @@ class LocalErrors:
         return tuple(local)
 
     def touched(self, leaves: Tensor) -> float:
-        """Return the share of tiles that these variances touch, of all levels that have any."""
+        """Return the share of tiles that these variances touch, over all levels with tiles."""
         variances = detail_variances(leaves, self._metric.observer.true_means)
         fine = variances[len(self._coarse.details) :]
         found = [
@@ -187,9 +188,9 @@ class LocalErrors:
         kept: Tensor | None = None,
         tiles: Sequence[Place] = (),
     ) -> Tensor:
-        """Return the local errors of a level, those that are kept but for tiles.
+        """Return the local errors of a level: those in ``kept``, except in ``tiles``.
 
-        (1, 1, h, w), with what is put before the first nodes.
+        The shape is (1, 1, h, w), with the padding before the first nodes.
         """
         if kept is None:
             local, cut = variance.new_empty(1, 1, *level.size), level.strips
@@ -201,7 +202,7 @@ class LocalErrors:
         together = max(AT_ONCE // (9 * cut.nodes), 1)
         for first in range(0, len(tiles), together):
             places = tiles[first : first + together]
-            # The coarsest level of a part of an image has the parents that it is given.
+            # The coarsest level of a part of an image takes the parents that it is given.
             part = Cortex(
                 (cut.around(level.details, places, 1),),
                 (cut.around(level.parents, places, 2),),
@@ -232,19 +233,19 @@ def local_errors(
     Parameters
     ----------
     metric
-        Who judges.
+        The metric that judges.
     truth
         The image, with the details that it is taken to have.
     variances
-        Of its details.
+        Variances of its details.
     leaves
-        (1, 3, H, W), of its pixels.
+        (1, 3, H, W), variances of its pixels.
 
     Returns
     -------
     tuple of Tensor
-        One (1, 1, h, w) a level, level 0 first, in JND to the power of the summation. The lowpass
-        term is in level 0, which an image of one pixel has too.
+        One (1, 1, h, w) per level, level 0 first, in JND to the power of the summation exponent.
+        The lowpass term is in level 0, which an image of one pixel has too.
     """
     mean = leaves.mean((-2, -1), keepdim=True, dtype=torch.float64)
     of_mean = mean / leaves[0, 0].numel()
@@ -256,7 +257,7 @@ def local_errors(
 
 
 def _touched(variance: Tensor, before: Tensor, level: _Level) -> list[Place]:
-    """Return the tiles in which a variance (1, 3, n, h, w), or that of a neighbour, differs."""
+    """Return the tiles in which a variance (1, 3, n, h, w), or a neighbour's, differs."""
     differs = (variance != before).flatten(1, 2).any(1, keepdim=True).to(torch.float32)
     (height, width), (top, left), tiles = level.size, level.before, level.tiles
     sides = (left + 1, tiles.across * TILE - width + 1, top + 1, tiles.down * TILE - height + 1)
@@ -265,7 +266,7 @@ def _touched(variance: Tensor, before: Tensor, level: _Level) -> list[Place]:
 
 
 def _side(nodes: int, most: int, multiple: int) -> int:
-    """Return the side of as few equal pieces as cover so many nodes, a multiple with the halo."""
+    """Return the side of the fewest equal pieces that cover the nodes; with halo a ``multiple``."""
     most = (most + 2 * HALO) // multiple * multiple - 2 * HALO
     each = -(-nodes // -(-nodes // most))
     return -(-(each + 2 * HALO) // multiple) * multiple - 2 * HALO

@@ -1,9 +1,9 @@
-"""The variance of every pixel, shrunk towards its neighbourhood's: no variance seen is not none.
+"""The variance of every pixel, shrunk towards that of its neighbourhood.
 
-Where a pixel's first samples all miss a small light, their variance is 0. What its neighbours saw
-is then the better estimate. Every node of the quad-tree has a pooled variance; from the root down,
-each is mixed with its parent's (empirical Bayes), by how much each of them knows; where its own
-samples refute the parent's, it is left alone.
+Where a pixel's first samples all miss a small light, their variance is 0, but the true one is not.
+The variance of its neighbours is then the better estimate. Every node of the quadtree has a pooled
+variance; from the root down, each is mixed with its parent's (empirical Bayes), weighted by how
+well each is known. Where a node's own samples refute the parent's, the node keeps its own.
 """
 
 import numpy as np
@@ -15,45 +15,45 @@ from sampling.statistics import FIRST, SECOND, Statistics, scalar_second
 
 Plane = NDArray[np.float64]
 
-# The least that the parent's variance is worth, in degrees of freedom of the node's own. A
-# variance from n samples with a kurtosis of k has 2 n / (k - 1): n for normal noise, and twice
-# the number of events where noise is rare events. Status: choice, measured.
+# Least prior strength of the parent's variance, in degrees of freedom. A variance from n samples
+# of kurtosis k has 2 n / (k - 1) of them: n for normal noise, and twice the number of events where
+# the noise is rare events. Status: choice, measured.
 PRIOR = 4.0
 
-# Most that it is ever worth. Status: choice.
+# Largest prior strength. Status: choice.
 LARGEST_PRIOR = 1000.0
 
-# A relative distance between variances, squared, counts for no more. Status: choice; rare events
-# would otherwise speak for all their neighbours.
+# Upper limit of a squared relative distance between variances. Status: choice; rare events would
+# otherwise dominate all their neighbours.
 FARTHEST = 4.0
 
-# A node is at most so many times as bright as its parent, the mean of four. More is left over where
-# a channel is 0 but for rounding, as in a saturated colour.
+# A node is at most so many times as bright as its parent, the mean of four. A larger ratio is due
+# to rounding in a channel that should be 0, as in a saturated colour.
 LARGEST_SCALE = 4.0
 
-# A prior is dropped where chance would leave any node of a level so far under it in no more than
-# this share of images. Status: choice.
+# A prior is dropped where chance would put any node of its level so far below it in at most this
+# share of images. Status: choice.
 SIGNIFICANCE = 0.05
 
-# A prior of no more than so many times the own variance is not doubted. Status: choice.
+# A prior of at most so many times the node's own variance is not tested. Status: choice.
 CLOSE = 2.0
 
-# A node that has shown no light at all refutes with so many times fewer events: a part of it may
-# be lit. Status: choice, measured.
+# For a node that has shown no light at all, the test assumes so many times fewer events: a part of
+# it may be lit. Status: choice, measured.
 BLACK = 8.0
 
-# Nodes on each side over which it is averaged what a prior is worth. Status: choice.
+# Radius of the window over which prior strengths are averaged, in nodes. Status: choice.
 REACH = 2
 
 # Nodes of a level that are computed at once. Status: choice, measured.
 AT_ONCE = 2**15
 
-# Kurtosis of normal noise, where none has been seen.
+# Kurtosis of normal noise, used where none has been observed.
 NORMAL = 3.0
 
 
 def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
-    """Return the covariance of a single sample of every pixel, shrunk, (6, H, W).
+    """Return the shrunk covariance of a single sample of every pixel, (6, H, W).
 
     ``size`` is height and width; the order is that of `Statistics.comoments`.
     """
@@ -79,8 +79,8 @@ def pooled_covariance(statistics: Statistics, size: tuple[int, int]) -> Plane:
 def _refined(nodes: Plane, estimate: Plane, mean: Plane) -> tuple[Plane, Plane]:
     """Return estimate and mean of the ``nodes`` of a level from those of their parents.
 
-    A few rows at a time, which stay in the processor's cache: of large planes every page would be
-    had from the system anew.
+    It works on a few rows at a time, which stay in the processor's cache: every page of a large
+    plane would be requested from the system anew.
     """
     height, width = nodes.shape[1:]
     rows = max(AT_ONCE // width, 1)
@@ -97,22 +97,22 @@ def _refined(nodes: Plane, estimate: Plane, mean: Plane) -> tuple[Plane, Plane]:
 
 
 def _mixed(nodes: Plane, between: Plane, count: int) -> tuple[Plane, Plane]:
-    """Return estimate and mean of nodes, their own mixed with what lies ``between`` their parents.
+    """Return estimate and mean of nodes, their own mixed with those of their parents.
 
-    ``count``: of the nodes of their level.
+    ``between`` is the result of `_between`; ``count`` is the number of nodes of the level.
     """
     own, own_mean = _own(nodes)
     parent, parent_mean = between[:7], between[7:10]
-    # Over means of squares, and not squares of means: else a node near a lamp would have its
-    # noise but neither its light nor the kurtosis of it.
+    # Divide by means of squares, not by squares of means: otherwise a node near a lamp would have
+    # the lamp's noise but neither its light nor its kurtosis.
     kurtosis = _ratio(parent[6], between[13], NORMAL)
     freedom = 2.0 * nodes[11] / np.maximum(kurtosis - 1.0, 1e-3)
-    # A chance of p has a kurtosis of 1 / (p (1 - p)) - 3.
+    # An event of probability p has a kurtosis of 1 / (p (1 - p)) - 3.
     events = nodes[11] / (kurtosis + 3.0)
     seen = scalar_second(own[:6])
-    # What is black has a rule of its own, below; its mean is believed late.
+    # Black nodes have a rule of their own, below; their mean is believed late.
     lit = (own[:6] != 0.0).any(0) | (own_mean != 0.0).any(0)
-    # The mean, which scales what the parents know, is shrunk by the least weight.
+    # The mean, which scales the parents' variance, is shrunk with the least prior strength.
     weight = PRIOR / (PRIOR + freedom)
     doubtful = np.where(lit, events, events / BLACK)
     weight *= _unrefuted(seen, scalar_second(parent[:6]), doubtful, count)
@@ -132,10 +132,10 @@ def _mixed(nodes: Plane, between: Plane, count: int) -> tuple[Plane, Plane]:
 
 
 def _worth(own: Plane, prior: Plane, freedom: Plane) -> Plane:
-    """Return what the prior is worth, in degrees of freedom, at every node.
+    """Return the prior strength, in degrees of freedom, at every node.
 
-    How far the nodes' own variances lie from the prior, beyond what their few samples explain,
-    is how far the truth does: 2 over its square. Averaged over neighbours.
+    The distance of the nodes' own variances from the prior, beyond what their few samples explain,
+    estimates that of the true ones, averaged over neighbours. The strength is 2 over its square.
     """
     apart = _ratio(own, prior, 1.0) - 1.0
     chance = 2.0 / np.maximum(freedom, 1e-3)
@@ -146,14 +146,14 @@ def _worth(own: Plane, prior: Plane, freedom: Plane) -> Plane:
 def _unrefuted(own: Plane, prior: Plane, events: Plane, count: int) -> Plane:
     """Return how much of a prior the nodes' own variances leave, 1 to 0.
 
-    Had they the prior's noise, at least ``events`` events would be expected of it. That no more
-    than what was seen come of them has a chance of exp(-D) at most, D the deviance of a Poisson
-    number (Chernoff), where `CLOSE` times as many stand for what was seen; times ``count``, the
-    nodes of the level, that any of them falls so low. All of the prior is left where this is 1,
-    none where it is `SIGNIFICANCE`.
-    Without it a lamp in one pixel was believed of the whole image: what was left of it by the
-    weight of the nodes' own samples, next to nothing of many thousand times their noise, came down
-    to the pixels with a kurtosis that none of them could refute.
+    If a node had the prior's noise, at least ``events`` events would be expected in it. That no
+    more occur than its own variance shows, taken `CLOSE` times, has a probability of at most
+    exp(-D), where D is the deviance of a Poisson count (Chernoff). Times ``count``, the nodes of
+    the level, this bounds the probability that any of them falls so low. The whole prior is left
+    where the bound is 1, none where it is `SIGNIFICANCE`.
+    Without this test a lamp in one pixel was believed of the whole image. The weight of the nodes'
+    own samples left a tiny share of a prior with many thousand times their noise, and this share
+    came down to the pixels with a kurtosis that none of them could refute.
     """
     share = np.minimum(CLOSE * _ratio(own, prior, 1.0), 1.0)
     entropy = share * np.log(np.where(share > 0.0, share, 1.0))
@@ -163,13 +163,13 @@ def _unrefuted(own: Plane, prior: Plane, events: Plane, count: int) -> Plane:
 
 
 def _chance_of_light(freedom: Plane) -> Plane:
-    """Return how likely it is that a node that has shown no light has any.
+    """Return the probability that a node that has shown no light has any.
 
-    What is black is as a rule the background, or a black surface, and no sample will change it. Had
-    a share of the node, whichever, its parent's light, it would show none in ``freedom`` / 2
-    expected events with a chance of 2 / freedom; against an even chance of its being black.
-    Without this a black background beside a light that is seldom hit took most samples, for there
-    is nothing in it that noise could hide behind.
+    Black is usually the background or a black surface, and no sample will change it. If a share of
+    the node, all shares equally likely, had its parent's light, it would show none in
+    ``freedom`` / 2 expected events with probability 2 / freedom; against this stands an even chance
+    that it is black. Without this rule a black background next to a light that is rarely hit took
+    most samples, because nothing in it masks noise.
     """
     chance: Plane = 1.0 / np.maximum(1.0, 0.5 * freedom)
     return chance
@@ -185,7 +185,7 @@ def _smooth(plane: Plane) -> Plane:
 def _own(sums: Plane) -> tuple[Plane, Plane]:
     """Return covariance and fourth moment of the samples of each node, and its mean.
 
-    About the means of the pixels, not of the node: a texture is no noise.
+    They are about the means of the pixels, not of the node: a texture is not noise.
     """
     count = np.maximum(sums[11], 1.0)
     covariance = sums[:6] / np.maximum(sums[10], 1.0)
@@ -198,7 +198,7 @@ def _ratio(over: Plane, under: Plane, otherwise: float) -> Plane:
 
 
 def _four(plane: Plane) -> Plane:
-    """Return the sums of 2x2 nodes; an odd side ends in nodes of fewer."""
+    """Return the sums of 2x2 nodes; on an odd side the last sums are of fewer."""
     height, width = plane.shape[1:]
     even = np.pad(plane, ((0, 0), (0, height % 2), (0, width % 2)))
     rows = even[:, 0::2] + even[:, 1::2]
@@ -207,13 +207,13 @@ def _four(plane: Plane) -> Plane:
 
 
 def _between(parents: Plane, rows: tuple[int, int], width: int) -> Plane:
-    """Give nodes, from one row to another, what their four nearest parents have (bilinear).
+    """Return, for a range of rows of nodes, the bilinear mean of their four nearest parents.
 
-    Its own parent alone would know nothing of what lies across the border of a large node: pixels
-    beside that border stayed at no variance where rare light ended there.
+    A node's own parent alone knows nothing of what lies across the border of a large node: where
+    rare light ended there, pixels next to that border stayed at zero variance.
     """
     first, last = rows
-    # A row of parents more on each side, for the ends of what is enlarged lie beyond its parents.
+    # One more row of parents on each side, because the ends of the enlarged rows lie beyond theirs.
     low, high = max(first // 2 - 1, 0), (last + 1) // 2 + 1
     tensor = torch.from_numpy(parents[:, low:high])[None]
     between = functional.interpolate(tensor, scale_factor=2.0, mode="bilinear")

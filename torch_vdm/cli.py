@@ -38,26 +38,26 @@ from torch_vdm.vdm import VDM
 
 DONE, EXCEEDED, BAD_INPUT, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130
 
-# Assumed where nothing is given; each is printed. Status: choice. 60 pixels per degree is a
+# Assumed if nothing is given; each is printed. Status: choice. 60 pixels per degree is a
 # 27-inch screen of 3840 x 2160 from 0.53 m; 100 cd/m2 is the white of BT.1886 and Display.srgb.
 PPD = 60.0
 WHITE = 100.0
 
-# Images of more pixels are compared in tiles, if nothing else is asked: whole, one of them would
-# take four gigabytes. Status: choice.
+# Images with more pixels are compared in tiles, unless otherwise requested: whole, one of them
+# would take four gigabytes. Status: choice.
 LARGEST_WHOLE = 2**24
 
-# How the image is decomposed: what accuracy costs.
+# How the image is decomposed at each accuracy.
 TRANSFORMS: dict[str, Callable[[], Transform]] = {
     "fast": Haar,
     "standard": partial(StationaryHaar, csf="filter"),
     "reference": Steerable,
 }
 
-# What judges by default; the paper's observer has the paper's own transform.
+# The default accuracy of each observer; the paper's has the paper's own transform.
 ACCURACY = {"calibrated": "standard", "paper": "fast"}
 
-# What must be told of the quickest.
+# What must be reported about the fastest.
 MAY_MISS = (
     "accuracy fast: at single places, where it meets borders of its nodes, a faint edge may be "
     "missed; --accuracy standard has no such places"
@@ -71,7 +71,7 @@ class UsageError(ValueError):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line, and to which -1e-1 is a number and no option."""
+    """A parser whose errors are one line, and which takes -1e-1 as a number, not an option."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -102,15 +102,15 @@ def run(
     command: Callable[[], int],
     refusals: tuple[type[ValueError], ...] = (ImageError, UsageError),
 ) -> int:
-    """Run a command; return its exit status, for an error after one line that begins with its name.
+    """Run a command; return its exit status. An error is one line that begins with its name.
 
     ``command`` returns the status of a run without an error; ``refusals`` are the errors that mean
-    bad input. All others are the program's own: 3, and never 1, which says that something was
+    bad input. All others are the program's own and give 3, never 1, which says that something was
     exceeded.
     """
     _keep_standard_numbers()
     if isinstance(sys.stdout, io.TextIOWrapper):
-        # A file's name may have letters that the terminal lacks.
+        # A file's name may have characters that the terminal lacks.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         return command()
@@ -135,9 +135,9 @@ def _ended(program: str, why: str, status: int) -> int:
 
 
 def _internal(error: Exception) -> str:
-    """One line for an error that is not the user's."""
+    """Return one line for an error that is not the user's."""
     text = printable(" ".join(str(error).split()))
-    # PyTorch says so in words.
+    # PyTorch reports missing memory in words.
     if isinstance(error, MemoryError) or ("alloc" in text and "memory" in text):
         why = text if isinstance(error, MemoryError) and text else "not enough memory"
         return f"{why}; make the images smaller, or compare in tiles (--tile {TILE})"
@@ -145,7 +145,7 @@ def _internal(error: Exception) -> str:
 
 
 def _keep_standard_numbers() -> None:
-    """Let no file that is opened later take the number of a closed standard stream."""
+    """Keep files that are opened later from taking the number of a closed standard stream."""
     number = os.open(os.devnull, os.O_RDWR)
     while number <= 2:
         number = os.open(os.devnull, os.O_RDWR)
@@ -154,7 +154,7 @@ def _keep_standard_numbers() -> None:
 
 @contextlib.contextmanager
 def _usage() -> Iterator[None]:
-    """Take a value that the model refuses for what it is: an option."""
+    """Treat a value that the model refuses as what it is: an option."""
     try:
         yield
     except ValueError as error:
@@ -314,7 +314,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     options.accuracy = options.accuracy or ACCURACY[options.observer]
     with _usage():
         options.ppd, seen_from = _viewing(options)
-    # Said once, as pixels per degree: the same view is then the same setting.
+    # Stored as pixels per degree alone: the same view is then the same setting.
     options.screen = options.diagonal = options.distance = None
     assumptions = [seen_from]
     if options.accuracy == "fast" and options.observer == "calibrated":
@@ -344,7 +344,7 @@ def _metric(display: Display, options: argparse.Namespace) -> VDM:
 
 
 def _compare(reference: Path, test: Path, options: argparse.Namespace) -> int:
-    # For the maps of large images; one that cannot be removed is not worth a failure.
+    # These hold the maps of large images; one that cannot be removed is not worth a failure.
     with contextlib.ExitStack() as rooms:
         return _compare_with(rooms, reference, test, options)
 
@@ -446,7 +446,7 @@ def _in_tiles(metric: VDM, pair: Pair, tile: int, rooms: contextlib.ExitStack) -
 def check_outputs(inputs: Sequence[Path], outputs: Sequence[Path | None]) -> None:
     """Refuse, before anything is computed, what could not be written or would destroy an input.
 
-    An output that is None is not asked for.
+    An output that is None is not wanted.
     """
     taken = {Path(os.path.realpath(path)): path for path in inputs}
     for path in outputs:
@@ -468,14 +468,14 @@ def json_path(options: argparse.Namespace) -> Path | None:
 
 
 def tell(text: str) -> None:
-    """Print, and do not mind a reader that has read enough, or none at all."""
+    """Print, and ignore a reader that has closed the stream, or none at all."""
     if sys.stdout is None:
         return
     try:
         sys.stdout.write(text)
         sys.stdout.flush()
     except BrokenPipeError:
-        # Python flushes standard output once more at its end: let that go nowhere.
+        # Python flushes standard output once more at exit: let that go nowhere.
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 

@@ -1,4 +1,4 @@
-"""Work that a cluster of Dask shares, on this machine or on many; workers may go at any time.
+"""Work shared by a Dask cluster, on this machine or on many; workers may leave at any time.
 
 It needs Dask's ``distributed``, which is imported when work begins.
 """
@@ -23,18 +23,18 @@ from torch_vdm.io.refusal import printable
 if TYPE_CHECKING:
     import distributed
 
-# What ``--scheduler`` is given for workers on this machine.
+# The value of ``--scheduler`` for workers on this machine.
 LOCAL = "local"
 
-# What is installed to have it.
+# How Dask is installed.
 EXTRA = "pip install 'torch-vdm[cluster]'"
 
-# Units that the scheduler has at once: at least so many, so that a cluster that scales by what
-# waits sees that there is work, and so many for each thread, so that none waits for this process.
-# About 10 kB each are held for them. Status: choice.
+# Units that the scheduler has at once: at least so many, so that a cluster that scales with its
+# queue sees that there is work, and so many for each thread, so that none waits for this process.
+# Each takes about 10 kB. Status: choice.
 FEWEST_IN_HAND, IN_HAND_PER_THREAD = 256, 4
 
-# Seconds for which the number of threads of the cluster is believed. Status: choice.
+# Seconds for which the cluster's number of threads is taken as unchanged. Status: choice.
 BELIEVED = 5.0
 
 Unit = TypeVar("Unit", bound=Hashable)
@@ -48,17 +48,17 @@ class ClusterError(ValueError):
 
 
 class Work(NamedTuple):
-    """What workers are sent.
+    """What is sent to workers.
 
     Attributes
     ----------
     version
-        Of this package, which a worker must have too.
+        The version of this package, which a worker must have too.
     shared
         A file in the output folder, which a worker must see too.
     function
-        Of what is told of a unit, pickled: a worker unpickles it once, and what it keeps is then
-        made once for each of a worker's threads.
+        The function that does a unit, pickled: each of a worker's threads unpickles it once, so
+        what it keeps is made once for each thread.
     """
 
     version: str
@@ -67,7 +67,7 @@ class Work(NamedTuple):
 
 
 def check(scheduler: str, count: int | None) -> None:
-    """Refuse, before anything is done, a scheduler that cannot be had, or workers of another's.
+    """Refuse, before anything is done, a missing scheduler, or a worker count for a given cluster.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def check(scheduler: str, count: int | None) -> None:
 
 
 def work(function: Callable[..., Any], shared: Path) -> Work:
-    """Return a function that can be pickled as workers are sent it; ``shared`` as in `Work`."""
+    """Return a function that can be pickled as it is sent to workers; ``shared`` as in `Work`."""
     return Work(__version__, shared.absolute(), pickle.dumps(function))
 
 
@@ -97,27 +97,27 @@ def answers(
 ) -> Generator[tuple[Unit, Any], None, None]:
     """Yield units with their answers as they come, each once.
 
-    A unit whose worker goes away is done by another one: doing one twice must do no harm. Workers
-    that die several times over are blamed on the units that they had: these are then done one at a
-    time, and one that still has its workers die has no answer.
+    A unit whose worker goes away is done by another one: doing one twice must do no harm. If
+    workers die several times over, the units that they had are suspected: these are then done one
+    at a time, and one whose workers still die has no answer.
 
     Parameters
     ----------
     sent
-        What does a unit.
+        The work that does a unit.
     units
-        What to do; they are taken as there is room, and not held.
+        The units to do; they are taken as there is room, and not stored.
     told
-        What the function is given for a unit.
+        Returns the function's arguments for a unit.
     scheduler
         The address of a scheduler, a scheduler file, or `LOCAL`.
     count
-        Number of workers of `LOCAL`, of one thread each; None for one a processor.
+        Number of workers of `LOCAL`, of one thread each; None for one per processor.
 
     Yields
     ------
     tuple
-        The unit, and its answer, None for one of which workers died.
+        The unit, and its answer: None for one whose workers died.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def answers(
                     suspects.append(unit)
                 else:
                     yield unit, answer
-        # Alone, so that a worker's death is nobody else's doing.
+        # One at a time, so that no other unit can have caused a worker's death.
         for unit in suspects:
             hands.take(iter((unit,)))
             yield from hands.done()
@@ -193,7 +193,7 @@ class _Hands(Generic[Unit]):
 
 
 def _check_died(error: BaseException, unit: Hashable) -> None:
-    """Raise what ended a unit, unless it was its workers' death."""
+    """Raise the error that ended a unit, unless its workers died."""
     from distributed import KilledWorker
 
     if isinstance(error, KilledWorker):
@@ -240,7 +240,7 @@ def _client(scheduler: str, count: int | None) -> Generator["distributed.Client"
     import distributed
 
     with ExitStack() as stack:
-        # What ends a run is said in one line, and that workers come and go is no news.
+        # What ends a run is reported in one line, and workers that come and go are no news.
         stack.enter_context(_quiet())
         if scheduler == LOCAL:
             with no_interrupts():
@@ -250,7 +250,7 @@ def _client(scheduler: str, count: int | None) -> Generator["distributed.Client"
                     dashboard_address="127.0.0.1:0",  # any free port: several may run
                     # The machine's memory is the limit, as it is for processes without a cluster.
                     memory_limit=0,
-                    # Nobody takes these workers away: one that dies has died of what it did.
+                    # Nobody takes these workers away: one that dies was killed by its own work.
                     scheduler_kwargs={"allowed_failures": 0},
                     silence_logs=logging.CRITICAL,
                 )
@@ -299,7 +299,7 @@ def _quiet() -> Iterator[None]:
 
 @contextmanager
 def no_interrupts() -> Iterator[None]:
-    """Let processes that are started here never see Ctrl-C, which is this process's to answer."""
+    """Hide Ctrl-C from processes that are started here: only this process handles it."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

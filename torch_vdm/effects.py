@@ -7,7 +7,7 @@ from torch_vdm.options import switch
 
 @dataclass(frozen=True)
 class Effects:
-    """Switches; an effect that is off is not computed.
+    """Switches of effects; an effect that is off is not computed.
 
     Attributes
     ----------
@@ -18,7 +18,7 @@ class Effects:
     masking
         The transducer. Off: the response is the weighted contrast, 1 at threshold.
     pooling
-        The 3x3 pooling. Off: every node for itself.
+        The 3x3 pooling. Off: every node by itself.
     """
 
     aberration: bool = True
@@ -27,7 +27,7 @@ class Effects:
     pooling: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse what is no switch."""
+        """Refuse anything but True or False."""
         for field in fields(self):
             switch(field.name, getattr(self, field.name))
 

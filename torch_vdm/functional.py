@@ -1,4 +1,4 @@
-"""The metric and the loss as functions; the modules behind them are made once and kept."""
+"""The metric and the loss as functions; the modules behind them are made once and cached."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -10,7 +10,7 @@ from torch import Tensor
 from torch_vdm.loss import VDMLoss
 from torch_vdm.vdm import VDM
 
-# Modules that are kept, one for each set of options and device. Status: choice.
+# How many modules are cached, one for each set of options and device. Status: choice.
 MOST_KEPT = 32
 
 
@@ -29,7 +29,7 @@ def visual_difference(test: Tensor, reference: Tensor, ppd: float = 60.0, **opti
     Raises
     ------
     ValueError
-        Where an option or an image is not as stated.
+        If an option or an image is not as stated.
     """
     seen: Tensor = _module(VDM, test, ppd, options)(test, reference)
     return seen
@@ -61,7 +61,7 @@ def visual_difference_loss(
     Raises
     ------
     ValueError
-        Where an option or an image is not as stated.
+        If an option or an image is not as stated.
     """
     loss: Tensor = _module(VDMLoss, test, ppd, options)(test, reference, mask)
     return loss
@@ -71,7 +71,7 @@ def _module(kind: Callable[..., Any], image: Tensor, ppd: float, options: dict[s
     device = image.device if isinstance(image, Tensor) else torch.device("cpu")
     try:
         return _kept(kind, device, ppd, **options)
-    except TypeError:  # an option that cannot be a key: the module says what is wrong with it
+    except TypeError:  # an option that is not hashable: the module says what is wrong with it
         return kind(ppd, **options).to(device)
 
 

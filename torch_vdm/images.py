@@ -1,4 +1,4 @@
-"""What images may be, and what is done where they are not: in words, and to their pixels."""
+"""What images may be, and what is done if they are not: messages, and repairs of pixels."""
 
 import sys
 
@@ -9,18 +9,18 @@ from torch.nn import functional
 
 from torch_vdm.model.quadtree import push
 
-# A picture that has a higher sRGB code than this, or a larger share of values below the lowest, is
-# taken for none: filters and noise leave less. Status: choice.
+# An image with a higher sRGB code than this, or a larger share of values below the lowest, is taken
+# not to be sRGB-coded: filters and noise leave less. Status: choice.
 HIGHEST_CODE, LOWEST_CODE, MOST_BELOW = 2.0, -0.1, 0.05
 
-# Pixels a side of the largest square whose mean stands for a pixel that no image has. Status:
-# choice.
+# Pixels a side of the largest square whose mean replaces a pixel that is finite in neither image.
+# Status: choice.
 SQUARE = 64
 
 
 def refuse_onnx() -> None:
-    """Raise where a graph is made for ONNX."""
-    # Not imported for the question alone.
+    """Raise if a graph is made for ONNX."""
+    # Not imported just to ask.
     onnx = None if torch.compiler.is_dynamo_compiling() else sys.modules.get("torch.onnx")
     if onnx is not None and onnx.is_in_onnx_export():
         raise ValueError(
@@ -49,7 +49,7 @@ def remedy(shape: tuple[int, ...]) -> str:
 
 
 def has_values(image: Tensor) -> bool:
-    """Return whether there is anything to read: not in a meta or a fake tensor."""
+    """Return whether there are values to read, which a meta or a fake tensor lacks."""
     return not (image.is_meta or is_fake(image))
 
 
@@ -64,8 +64,8 @@ def can_be_read(image: Tensor) -> bool:
 
 
 def require_finite(name: str, image: Tensor, origin: tuple[int, int, int]) -> None:
-    """Raise where ``image`` has NaN or infinity, naming the first such item and pixel."""
-    # One cheap pass: the sum of an image that is not finite is not.
+    """Raise if ``image`` has NaN or infinity, naming the first such item and pixel."""
+    # One cheap pass: the sum of an image that is not finite is not finite either.
     if bool(torch.isfinite(image.detach().sum())):
         return
     bad = ~torch.isfinite(image.detach())
@@ -103,11 +103,12 @@ def masked(plane: Tensor, seen: Tensor | None) -> Tensor:
 
 
 def finite_in_both(test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return both images, equal where a channel of either is not finite, and where all are.
+    """Return both images, equal where a channel of either is not finite, and where all are finite.
 
-    (B, 3, H, W) twice, and (B, 1, H, W), boolean. A pixel that one image has is taken for both;
-    one that neither has gets the mean of the smallest square around it in which there is any, of
-    2, 4 ... `SQUARE` pixels a side from the image's corner, so that it hides nothing around it.
+    They are (B, 3, H, W) twice, and (B, 1, H, W), boolean. A pixel that is finite in one image is
+    taken for both. One that is finite in neither gets the mean of the smallest square around it
+    with a finite pixel, of 2, 4 ... `SQUARE` pixels a side from the image's corner, so that it
+    masks nothing around it.
     """
     images = test.detach(), reference.detach()
     finite = [torch.isfinite(image).all(1, keepdim=True) for image in images]
@@ -121,10 +122,10 @@ def finite_in_both(test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Ten
 
 
 def _around(total: Tensor, count: Tensor, side: int) -> Tensor:
-    """Return at every pixel the mean of the smallest square that has any; 0 where none has.
+    """Return at every pixel the mean of the smallest square with a finite pixel; 0 if none has one.
 
     ``total`` (B, C, h, w) over ``count`` (B, 1, h, w) is the mean; the largest square has ``side``
-    pixels.
+    pixels a side.
     """
     mean = torch.where(count > 0.0, total / count, 0.0)
     if side == 1:

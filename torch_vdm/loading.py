@@ -20,7 +20,7 @@ from torch_vdm.run.tiling import Source, read
 
 @dataclass(frozen=True)
 class Pair:
-    """Two images made ready for one display."""
+    """Two images prepared for one display."""
 
     reference: Source
     test: Source
@@ -46,7 +46,7 @@ class Pair:
         return sums[0] / (height * width), sums[1] / (height * width)
 
     def coded(self) -> tuple[Tensor, Tensor]:
-        """Return reference and test as sRGB-coded images, small enough for a picture of them."""
+        """Return reference and test as sRGB-coded images, reduced to fit a panel."""
         reference, test = shrunk(self.reference), shrunk(self.test)
         if self.display.encoding == "srgb" and self.display.exposure == 0.0:
             return reference, test
@@ -61,7 +61,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class _Linear:
-    """An sRGB-coded source as linear values, of which 1.0 is ``white`` where 1.0 was coded."""
+    """An sRGB-coded source as linear values, where the code 1.0 becomes ``white``."""
 
     source: Source
     white: float
@@ -108,7 +108,7 @@ def _open(
 
 
 def _is_array(path: Path) -> bool:
-    # What cannot be opened is `load`'s to tell of; opening a pipe would wait for ever.
+    # `load` reports what cannot be opened; opening a pipe would wait for ever.
     with contextlib.suppress(OSError, ValueError):
         if path.is_file():
             with path.open("rb") as file:
@@ -129,8 +129,8 @@ def load_pairs(
 ) -> tuple[list[Pair], list[str]]:
     """Read both images, and say what was assumed; an array is read later, part by part.
 
-    There are several pairs where the files have several views, or where their transparency differs:
-    then no single background shows all of the difference.
+    There are several pairs if the files have several views, or if their transparency differs: then
+    no single background shows all of the difference.
     """
     paths = reference, test
     opened = [_open(path, options) for path in paths]
@@ -155,7 +155,7 @@ def load_pairs(
 
 
 def _require_one_size(images: Sequence[_Opened], first: _Opened, paths: Sequence[Path]) -> None:
-    """Refuse images of which one has another size than the first that was read."""
+    """Refuse images if one of them has another size than the first that was read."""
     for path, image in zip(paths, images, strict=True):
         sizes = ["{2} x {1}".format(*x.pixels.shape) for x in (first, image)]
         if sizes[0] != sizes[1]:
@@ -176,7 +176,7 @@ def _pair(
 
 
 def _light(image: _Opened, options: argparse.Namespace) -> Source:
-    """Return linear values, of which 1.0 is ``--white``."""
+    """Return linear values in which 1.0 is ``--white``."""
     if image.kind == "coded":
         return _Linear(image.pixels, options.peak / options.white)
     if image.kind == "absolute":
@@ -187,7 +187,7 @@ def _light(image: _Opened, options: argparse.Namespace) -> Source:
 
 
 def _scales(images: Sequence[_Opened], options: argparse.Namespace) -> Iterator[str]:
-    """What the values of the images are taken for."""
+    """Yield what the values of the images are taken for."""
     told = {
         "scene": f"linear BT.709, and 1.0 is {options.white:g} cd/m2 (--white)",
         "coded": f"sRGB, and white is {options.peak:g} cd/m2 (--peak)",
@@ -201,7 +201,7 @@ def _scales(images: Sequence[_Opened], options: argparse.Namespace) -> Iterator[
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """What the files are called where they must be told apart."""
+    """Return names of the files that tell them apart."""
     return (
         [str(path) for path in paths]
         if paths[0].name == paths[1].name
@@ -210,9 +210,9 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 
 def _common_views(images: Sequence[_Opened], paths: Sequence[Path]) -> tuple[list[str], list[str]]:
-    """The views to compare, by their names, and what is to be told of them.
+    """Return the views to compare, by their names, and what is to be reported about them.
 
-    None where a file has no views: then what each shows first is compared.
+    There are none if a file has no views: then what each shows first is compared.
     """
     one, other = (image.image.views if image.image else () for image in images)
     if not one or not other:
@@ -238,20 +238,20 @@ def _common_views(images: Sequence[_Opened], paths: Sequence[Path]) -> tuple[lis
 
 
 def _in_view(opened: _Opened, path: Path, options: argparse.Namespace, view: str | None) -> _Opened:
-    """Return what was opened, which is the first view of its file, or open another view of it."""
+    """Return what was opened, the first view of its file, or open another view of it."""
     first = opened.image.views[:1] if opened.image else ()
     return opened if view is None or view in first else _open(path, options, view)
 
 
 def _differ(images: Sequence[_Opened]) -> bool:
-    """Whether the transparency of two images differs."""
+    """Return whether the transparency of two images differs."""
     one, other = (image.image for image in images)
     if one is None or other is None:
         return False
     if one.alpha is not None and other.alpha is not None:
         return not torch.equal(one.alpha, other.alpha)
     for image in (one, other):
-        # An EXR without alpha, as a denoiser leaves it, has the picture over black all the same.
+        # An EXR without alpha, as a denoiser leaves it, still has the picture over black.
         if image.alpha is not None and not image.associated:
             return bool((image.alpha < 1.0).any())
     return False

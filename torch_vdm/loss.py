@@ -18,15 +18,15 @@ from torch_vdm.vdm import VDM
 
 Reduction = Literal["mean", "sum", "none"]
 
-# Weight of the L1 term. Status: choice, by experiment: of 0, 30, 60, 120, 240 and 360 the one with
+# Weight of the L1 term. Status: choice, by experiment: of 0, 30, 60, 120, 240 and 360, the one with
 # which 300 steps of Adam on its pixels bring a picture back under 1 JND everywhere with room to
-# spare, from noise, from flat grey, black and white, and from a shift by 8 pixels.
+# spare, starting from noise, from flat grey, black and white, and from a shift by 8 pixels.
 L1 = 360.0
 
 
-# The dark light of the loss's observer, cd/m2: of a screen in a lit room, a hundred times the eye's
-# own. A step away from black is then not seen at a contrast of hundreds: 300 steps of Adam lead
-# from black to the picture by the metric alone; with 0.02 they do not. Status: choice, measured.
+# The dark light of the loss's observer, cd/m2: as of a screen in a lit room, a hundred times the
+# eye's own. A step away from black then has no contrast of hundreds: 300 steps of Adam lead from
+# black to the picture with the metric alone; with 0.02 they do not. Status: choice, measured.
 DARK_LIGHT = 0.2
 
 
@@ -39,34 +39,35 @@ class VDMLoss(operators.Enrolled):
     """A perceptual loss: the mean of log(1 + p), and an L1 term.
 
     p is the map of `VDM` to the power of 2.4: smooth, 0 with gradient 0 where the images are equal.
-    The logarithm keeps far-off regions from drowning the rest: near threshold
-    the loss orders images as the map does, far from it it grows with the logarithm of the JND.
+    The logarithm keeps regions far above threshold from drowning out the rest: near threshold
+    the loss orders images as the map does; far above, it grows with the logarithm of the JND.
 
-    The L1 term is the mean absolute difference of sRGB-coded values (of light over the display's
-    white, for a display that takes light). It recovers what nobody sees, such as detail beyond the
-    eye's resolution, and finds the way where the metric alone has local minima.
+    The L1 term is the mean absolute difference of sRGB-coded values (of light relative to the
+    display's white, for a display that takes light). It recovers what nobody sees, such as detail
+    beyond the eye's resolution, and finds the way where the metric alone has local minima.
 
-    Finite with a finite gradient for every finite image. A gradient that a half-precision image
-    cannot hold reaches it as infinity, by which `torch.amp.GradScaler` lowers its scale.
+    The loss is finite, with a finite gradient, for every finite image. A gradient that a
+    half-precision image cannot hold arrives as infinity, which makes `torch.amp.GradScaler` lower
+    its scale.
 
     Parameters
     ----------
     ppd, display, options
-        As in `VDM`, but that the default observer is the calibrated one in a lit room, with a
-        hundred times its dark light, and called "lit room": else a step away from black would be
-        seen at any contrast.
+        As in `VDM`, except that the default observer is the calibrated one in a lit room, with a
+        hundred times its dark light, and called "lit room": otherwise a step away from black could
+        be seen at any contrast.
     l1
         Weight of the L1 term; 0: the metric alone.
     reduction
-        Over the batch: "mean", "sum", or "none" for one value an item, (B,).
+        Over the batch: "mean", "sum", or "none" for one value per item, (B,).
     checkpoint
-        Whether to keep less for the backward pass and compute it again there: about a third less
+        Whether to keep less for the backward pass and recompute it there: about a third less
         memory for up to a quarter more time, with the same gradients. Not with `torch.func`.
 
     Raises
     ------
     ValueError
-        Where a parameter or an image is not as stated.
+        If a parameter or an image is not as stated.
     """
 
     def __init__(
@@ -84,11 +85,11 @@ class VDMLoss(operators.Enrolled):
         if not (math.isfinite(l1) and l1 >= 0.0):
             raise ValueError(f"expected a weight l1 of 0 or more, got {l1}")
         if options.get("observer") is None:
-            # Fitted before it has a name of its own.
+            # Fitted before it gets a name of its own.
             observer = Observer.calibrated().fitted_to(options.get("transform") or Haar())
             options["observer"] = replace(observer, name="lit room", dark_light=DARK_LIGHT)
         self.metric = VDM(ppd, display, **options)
-        # An image that is not trained yet may have any values: its target has not.
+        # An image that is not trained yet may have any values; its target may not.
         self.metric._out_of_range_in = all
         self.metric._checkpointed = switch("checkpoint", checkpoint)
         self.l1 = l1
@@ -98,9 +99,9 @@ class VDMLoss(operators.Enrolled):
         """Return the loss of (B, 3, H, W) against (B, 3, H, W).
 
         ``mask`` (B, 1, H, W) weights the pixels, 0 to leave one out; a pixel that is left out
-        still is what its neighbours are seen against. A weight that is not finite or below 0 is a
-        ValueError, for which one number is read back from the device; with ``nonfinite="mask"`` or
-        in a graph of torch.export nothing is, and the loss is NaN.
+        is still the background of its neighbours. A weight that is not finite or below 0 is a
+        ValueError, for which one number is read back from the device. With ``nonfinite="mask"``,
+        or in a graph of torch.export, nothing is read back, and the loss is NaN.
         """
         by_mask = isinstance(mask, Tensor) and mask.requires_grad
         if operators.is_wanted() and self.metric._has_own_constants() and not by_mask:
@@ -112,9 +113,9 @@ class VDMLoss(operators.Enrolled):
         return items.sum() if self.reduction == "sum" else items
 
     def of_items(self, test: Tensor, reference: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Return the loss of every item, (B,); arguments as `forward`."""
+        """Return the loss of every item, (B,); arguments as in `forward`."""
         test, reference, seen = self.metric._checked(test, reference)
-        # The L1 term first: what it needs on the way is gone when the metric needs most.
+        # The L1 term first: its intermediate results are freed before the metric needs most memory.
         l1 = self.l1 * self._in_rows(test, reference) if self.l1 else 0.0
         power = self.metric._power(test, reference, seen)
         exponent = self.metric.observer.summation_exponent / EXPONENT
@@ -122,7 +123,7 @@ class VDMLoss(operators.Enrolled):
         return plane.mean((1, 2, 3)) if mask is None else self._weighted(plane, mask)
 
     def compile(self, *args: Any, **kwargs: Any) -> Self:  # type: ignore[override]
-        """Switch the metric to its fast route, `VDM.compile`."""
+        """Switch the metric to its compiled route, `VDM.compile`."""
         self.metric.compile(*args, **kwargs)
         return self
 

@@ -34,27 +34,27 @@ class VisualDifference(Metric):
     `compute` returns a dictionary of 0-dim tensors: ``mean_jnd`` over all pixels, ``max_jnd``, and
     ``visible_fraction``, the share of pixels over 1 JND; or one of them, as Lightning's
     ``self.log("jnd", metric)`` takes it. The states are a sum and a maximum in float64 (float32
-    where a device has nothing wider) and counts, and stay so through `half()` and the like:
-    batches, devices and processes add up to what one pass would give, and no image is kept.
+    if a device has nothing wider) and counts, and stay so through `half()` and the like: batches,
+    devices and processes add up to what one pass would give, and no image is kept.
 
     Parameters
     ----------
     ppd, display
         As in `VDM`.
     vdm_options
-        More for `VDM`, by name.
+        Further options of `VDM`, by name.
     figure
-        The one to compute, as a tensor; None: all three.
+        The figure to compute, as a tensor; None: all three.
     metric
-        A metric to take instead, such as `VDM.paper()`; then ``ppd``, ``display`` and
+        A metric to use instead, such as `VDM.paper()`; then ``ppd``, ``display`` and
         ``vdm_options`` are left out.
     options
-        For `torchmetrics.Metric`.
+        Those of `torchmetrics.Metric`.
 
     Raises
     ------
     ValueError
-        Where a parameter or an image is not as stated.
+        If a parameter or an image is not as stated.
     """
 
     is_differentiable = False
@@ -92,7 +92,7 @@ class VisualDifference(Metric):
         self.add_state("largest", zero.clone(), dist_reduce_fx="max")
         for name in ("pixels", "visible"):
             self.add_state(name, torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
-        # A collection takes metrics of equal states for one: those of other options never are.
+        # A collection merges metrics with equal states: those with other options never have them.
         self.add_state("options", _bits(self.vdm), dist_reduce_fx="max")
 
     @property
@@ -117,7 +117,7 @@ class VisualDifference(Metric):
         return found if self.figure is None else found[self.figure]
 
     def plot(self, val: Any = None, ax: Any = None) -> Any:
-        """Plot values of `compute`, by default the present one; as `torchmetrics.Metric.plot`."""
+        """Plot values of `compute`, by default the current one; as `torchmetrics.Metric.plot`."""
         return self._plot(val, ax)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], exclude_state: Sequence[str] = "") -> Self:

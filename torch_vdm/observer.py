@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from torch_vdm.options import number, switch
 
-# What is divided by, or is a root or a filter's place: never 0.
+# Parameters that are divisors, roots or positions of filters: never 0.
 POSITIVE = (
     "dark_light",
     "aberration_cutoff",
@@ -22,8 +22,8 @@ POSITIVE = (
 )
 
 
-# What the fit gives with other transforms than `Haar()`, whose numbers `Observer.calibrated` has,
-# by the transform's class and `csf`. Status: fitted, `python -m benchmarks calibrate`.
+# What the fit gives with transforms other than `Haar()`, by the transform's class and `csf`; that
+# for `Haar()` is in `Observer.calibrated`. Status: fitted, `python -m benchmarks calibrate`.
 FITTED: dict[tuple[str, str], dict[str, float]] = {
     ("StationaryHaar", "filter"): {
         "achromatic_gain": 398,
@@ -95,16 +95,16 @@ class Observer:
     signed
         Whether responses keep the sign of a detail. False: Eq. 4 on the energy, as printed.
     true_means
-        Whether a node at the border of an odd side counts for the pixels that it has. False: for
-        as many as its siblings, the last row or column repeated.
+        Whether a node at the border of an odd side counts for the pixels that it has. False: it
+        counts for as many as its siblings, with the last row or column repeated.
     dark_light
         The eye's own light, as an equal-energy light in cd/m2, added to what the eye adapts to.
     aberration_cutoff, aberration_exponent
         Attenuation of the S cones, exp(-(f / cutoff)^exponent); cutoff in cycles/degree.
     adaptation_luminance
         The luminance in cd/m2 that sets the contrast sensitivity everywhere, by Barten's formula
-        and without dimming of the chromatic channels; None: the local one, each node's parent's
-        lowpass, and the fitted curve.
+        and without dimming of the chromatic channels; None: the local one, the lowpass of each
+        node's parent, with the fitted curve.
     level_gain
         Whether a level's contrast is divided by its wavelet's peak gain.
     achromatic_gain
@@ -118,11 +118,11 @@ class Observer:
     peak_frequency, peak_luminance, peak_exponent
         Where A's sensitivity peaks, frequency (1 + luminance / L)^-exponent; cycles/degree.
     band_width, band_floor
-        Its width in octaves, to 1/e of the peak; what is left of it far below the peak.
+        The width of that peak in octaves, to 1/e; the fraction left far below the peak.
     red_green_gain, red_green_cutoff, red_green_order
         C1's Butterworth filter: sensitivity at low frequency, cutoff in cycles/degree, order.
     yellow_violet_gain, yellow_violet_cutoff, yellow_violet_order
-        C2's.
+        The same for C2.
     transducer_exponent
         q of the signed transducer 2^q v (1 + v^2)^-q.
     summation_exponent
@@ -131,7 +131,7 @@ class Observer:
         Sensitivity of A, C1, C2 to the Weber contrast between the two images' coarsest lowpass;
         None: never compared, as printed.
     charging
-        Whether a coarse difference counts only for the pixels that made it. False: for all
+        Whether a coarse difference counts only for the pixels that caused it. False: for all
         below it, as printed.
     """
 
@@ -167,7 +167,7 @@ class Observer:
     charging: bool
 
     def __post_init__(self) -> None:
-        """Refuse what no observer has; numbers of NumPy or torch become Python's."""
+        """Refuse invalid parameters; numbers of NumPy or torch become Python's."""
         if not isinstance(self.name, str):
             raise ValueError(f"expected name: a string, got {self.name!r}")
         for field in fields(self):
@@ -209,7 +209,7 @@ class Observer:
             level_gain=False,  # printed: no gain
             achromatic_gain=1.0,  # source: Barten 1989
             achromatic_size=12.0,  # degrees, choice
-            # One adaptation luminance and Barten's formula: none of these.
+            # Not used with one adaptation luminance and Barten's formula.
             dim_luminance=0.0,
             achromatic_dimming=0.0,
             chromatic_dimming=0.0,
@@ -230,23 +230,23 @@ class Observer:
             transducer_exponent=0.0,  # of the signed transducer only
             summation_exponent=2.4,  # printed: Eq. 5
             lowpass_gains=None,  # printed: never compared
-            charging=False,  # printed: every path has all of its nodes
+            charging=False,  # printed: every path sums all of its nodes
         )
 
     @classmethod
     def calibrated(cls) -> Self:
         """Return the default observer: it sees signs, uniform changes and the local luminance.
 
-        Its numbers are those fitted with `Haar()`; `VDM` puts those of its own transform in their
-        place, see `fitted_to`.
+        Its numbers are those fitted with `Haar()`; `VDM` replaces them with those of its own
+        transform, see `fitted_to`.
         """
         return cls(
             name="calibrated",
             signed=True,  # choice: a grating and its negative differ
-            true_means=True,  # choice: else one odd pixel outweighs half of the image
-            # cd/m2, choice: left free, the fit takes 0.00025, within a factor of 1.6; held
+            true_means=True,  # choice: otherwise one odd pixel outweighs half of the image
+            # cd/m2, choice: held fixed; left free, the fit gives 0.00025, within a factor of 1.6
             dark_light=0.0003,
-            aberration_cutoff=5.24,  # cpd, source: a model of the eye, docs/model.md; held
+            aberration_cutoff=5.24,  # cpd, source: a model of the eye, docs/model.md; held fixed
             aberration_exponent=2.15,
             adaptation_luminance=None,  # choice: local, as the eye adapts
             level_gain=True,  # choice: a grating at a level's best frequency has its contrast
@@ -254,7 +254,7 @@ class Observer:
             achromatic_size=12.0,  # degrees; of Barten's formula only
             dim_luminance=19.4,
             achromatic_dimming=0.213,
-            chromatic_dimming=0.5,  # source: de Vries and Rose, noise of photons; held
+            chromatic_dimming=0.5,  # source: de Vries and Rose, photon noise; held fixed
             glare_luminance=2000.0,
             glare_exponent=0.387,
             peak_frequency=2.85,
@@ -264,21 +264,21 @@ class Observer:
             band_floor=0.461,
             red_green_gain=348,
             red_green_cutoff=0.515,
-            red_green_order=1.0,  # choice: thresholds tell it from 0.9 by 0.05 dB; held
+            red_green_order=1.0,  # choice: thresholds tell it from 0.9 by 0.05 dB; held fixed
             yellow_violet_gain=138,
             yellow_violet_cutoff=0.502,
             yellow_violet_order=1.0,  # as that of C1
             transducer_exponent=0.3,  # choice: masking rises with Legge and Foley's slope, 0.6
-            summation_exponent=6.0,  # choice, by experiment: 2.4 and 4 make too much of noise
+            summation_exponent=6.0,  # choice, by experiment: 2.4 and 4 overrate noise
             lowpass_gains=(20.0, 76.0, 36.0),  # choice: a change of the mean by 5 % is 1 JND
-            charging=True,  # choice: else a lamp is seen everywhere
+            charging=True,  # choice: otherwise a lamp is seen everywhere
         )
 
     def fitted_to(self, transform: object) -> Self:
         """Return the observer with the numbers that were fitted with a transform.
 
-        ``transform`` is one of `torch_vdm.model.cortex`. Numbers that are not those of `calibrated`
-        stay as they are, and so does an observer of another name.
+        ``transform`` is one of `torch_vdm.model.cortex`. Numbers that differ from `calibrated` stay
+        as they are, and so does an observer with another name.
         """
         kind = type(transform).__name__, str(getattr(transform, "csf", ""))
         if self.name != "calibrated" or kind not in FITTED:

@@ -1,4 +1,4 @@
-"""What is wrong with an option is a ValueError, whatever it is."""
+"""Checks of options: whatever is wrong with one is a ValueError."""
 
 from collections.abc import Sequence
 
@@ -21,7 +21,7 @@ def switch(name: str, value: object) -> bool:
 
 
 def choice(name: str, value: object, known: Sequence[str]) -> None:
-    """Refuse an option that is none of those known."""
+    """Refuse an option that is not one of those known."""
     if not isinstance(value, str) or value not in known:
         *others, last = (f'"{one}"' for one in known)
         raise ValueError(f"expected {name} {', '.join(others)} or {last}, got {value!r}")

@@ -38,7 +38,7 @@ Nonfinite = Literal["raise", "mask"]
 # A number, or rows of numbers.
 Numbers = float | Sequence["Numbers"]
 
-# Constants that state dicts of before 0.1.0 held.
+# Constants that state dicts held before 0.1.0.
 FORMER = {field.name for field in fields(Observer)} | {
     "primaries",
     "cones",
@@ -57,8 +57,8 @@ FORMER = {field.name for field in fields(Observer)} | {
 class PairMetric(operators.Enrolled):
     """A metric that maps the visible differences of two images.
 
-    Subclasses give the accumulated differences of two checked batches, and how a plane of them
-    becomes one of pixels; they set their constants, see `_set_constants`.
+    Subclasses compute the accumulated differences of two checked batches, bring a plane of them to
+    pixel resolution, and set their constants, see `_set_constants`.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class PairMetric(operators.Enrolled):
     Raises
     ------
     ValueError
-        Where a parameter or an image is not as stated.
+        If a parameter or an image is not as stated.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class PairMetric(operators.Enrolled):
         self._compiles = False
         self._checkpointed = False
         self._range_is_known = False
-        # In which of both images values out of range are told: any, or all.
+        # Whether values out of range are reported if any of the two images has them, or all.
         self._out_of_range_in: Callable[[Iterable[bool]], bool] = any
         keep_freed_memory()
 
@@ -96,7 +96,7 @@ class PairMetric(operators.Enrolled):
 
     @property
     def _stackable(self) -> bool:
-        """Whether `_accumulated` takes items below one another; see `Job`."""
+        """Whether `_accumulated` takes items stacked vertically; see `Job`."""
         return False
 
     def _job(self, test: Tensor, reference: Tensor) -> Job:
@@ -115,16 +115,16 @@ class PairMetric(operators.Enrolled):
         )
 
     def _to_pixels(self, plane: Tensor, size: tuple[int, int], grid: Grid | None = None) -> Tensor:
-        """Return a plane of `_accumulated`, or of its root, at the pixels of the images.
+        """Return a plane of `_accumulated`, or of its root, at the resolution of the images.
 
         ``grid``: that of a part of an image.
         """
         raise NotImplementedError
 
     def _set_constants(self, constants: Mapping[str, Numbers]) -> None:
-        """Keep constants, of which ``summation_exponent`` is one, and register them as buffers.
+        """Keep constants, among them ``summation_exponent``, and register them as buffers.
 
-        They follow from the options: no state dict has them.
+        They follow from the options: no state dict holds them.
         """
         self._exact = dict(constants)
         for name in constants:
@@ -134,10 +134,10 @@ class PairMetric(operators.Enrolled):
     def _place(self, device: torch.device) -> None:
         """Make the constants on a device, anew from exact numbers.
 
-        Once for each precision of the computation, and once more as buffers, which show where the
-        module is. One that `torch.func.functional_call` replaces counts, and one that requires a
-        gradient; what else is done to it, as by a wrapper that casts it to half precision, in place
-        or not, changes no answer.
+        They are made once for each computing precision, and once more as buffers, which show where
+        the module is. A buffer is used if `torch.func.functional_call` replaces it or if it
+        requires a gradient; anything else done to it, such as a wrapper's cast to half precision,
+        in place or not, changes no result.
         """
         look_at(device)
 
@@ -147,7 +147,7 @@ class PairMetric(operators.Enrolled):
                 for name, value in self._exact.items()
             }
 
-        # Tensors of inference mode could not be trained with later.
+        # Tensors made in inference mode could not be used in training later.
         with torch.inference_mode(False):
             self._cast = {dtype: placed(dtype) for dtype in (torch.float32, widest(device))}
             self._own = placed(widest(device))
@@ -166,7 +166,7 @@ class PairMetric(operators.Enrolled):
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **options: Any
     ) -> None:
-        """Leave out the constants that checkpoints of before hold, with a warning."""
+        """Leave out the constants that older checkpoints hold, with a warning."""
         former = [name for name in FORMER if state_dict.pop(prefix + name, None) is not None]
         if former:
             warnings.warn(
@@ -177,11 +177,11 @@ class PairMetric(operators.Enrolled):
         super()._load_from_state_dict(state_dict, prefix, *args, **options)
 
     def compile(self, *args: Any, **kwargs: Any) -> Self:  # type: ignore[override]
-        """Switch to the fast route: one compiled function a level, for any size and batch.
+        """Switch to the compiled route: one compiled function per level, for any size and batch.
 
-        ``torch.compile(metric)``, or of a step that calls it, does not: there the metric is one
-        operator, which takes the route that it takes elsewhere. Takes no arguments; returns the
-        module itself, where `nn.Module.compile` returns nothing. Needs a C++ compiler.
+        ``torch.compile`` of the metric, or of a step that calls it, does not do this: there the
+        metric is one operator, which takes the same route as elsewhere. This takes no arguments,
+        needs a C++ compiler, and returns the module itself, unlike `nn.Module.compile`.
         """
         if args or kwargs:
             raise ValueError("expected no arguments: the fast route has no options")
@@ -210,12 +210,12 @@ class PairMetric(operators.Enrolled):
         return masked(self._to_pixels(jnd, (test.shape[-2], test.shape[-1])), seen)
 
     def power(self, test: Tensor, reference: Tensor) -> Tensor:
-        """Return the accumulated differences before the root, the map to a power.
+        """Return the accumulated differences before the root is taken: the map to a power.
 
-        That of the summation: 2.4 for the paper's observer, 6 for the calibrated one.
+        The power is the summation exponent: 2.4 for the paper's observer, 6 for the calibrated one.
 
-        (B, 1, H, W), from (B, 3, H, W) twice. Smooth where the images are equal, so that a loss
-        is taken from here; see `VDMLoss`.
+        It is (B, 1, H, W), from (B, 3, H, W) twice, and smooth where the images are equal, so that
+        a loss is taken from here; see `VDMLoss`.
         """
         if operators.is_wanted() and self._has_own_constants():
             return operators.difference_map(test, reference, self._number, power=True)
@@ -231,7 +231,7 @@ class PairMetric(operators.Enrolled):
         return all(self._is_own(name) for name in self._own)
 
     def _is_own(self, name: str) -> bool:
-        """Return whether a constant is what the options say: itself, or as a wrapper casts it."""
+        """Return whether a constant is as the options say: unchanged, or cast by a wrapper."""
         buffer = self._buffers[name]
         assert buffer is not None
         same = buffer is self._own[name] or buffer.dtype in (torch.float16, torch.bfloat16)
@@ -259,12 +259,12 @@ class PairMetric(operators.Enrolled):
             if items >= len(test):
                 return self._accumulated(test, reference)
             parts = zip(test.split(items), reference.split(items), strict=True)
-            # Copies, for compiled code is specialised on the offset of a view.
+            # Copies: compiled code is specialised on the offset of a view.
             totals = [self._accumulated(one.clone(), other.clone()) for one, other in parts]
         return torch.cat(totals)
 
     def _require_image(self, name: str, image: Tensor) -> None:
-        """Raise where ``image`` is not such as the metric takes, and say what makes it so."""
+        """Raise if ``image`` is not what the metric takes, and say how to make it so."""
         if not isinstance(image, Tensor):
             raise ValueError(
                 f"expected {name} that is a tensor (B, 3, H, W), got {type(image).__name__}; "
@@ -304,8 +304,8 @@ class PairMetric(operators.Enrolled):
                 f"got {tuple(test.shape)} and {tuple(reference.shape)}"
             )
         dtype = computed_in(test, reference)
-        # In one layout: a tensor in another takes other paths through the vectorised loops, and
-        # equal images would differ in their last bits.
+        # In one memory layout: another takes other paths through the vectorised loops, and equal
+        # images would differ in their last bits.
         test, reference = test.to(dtype).contiguous(), reference.to(dtype).contiguous()
         seen: Tensor | None = None
         if self.nonfinite == "mask":
@@ -317,11 +317,11 @@ class PairMetric(operators.Enrolled):
         return test, reference, seen
 
     def _reads(self, image: Tensor) -> bool:
-        """Return whether values are to be read back, to raise where they are wrong."""
+        """Return whether values are to be read back, to raise if they are wrong."""
         return self.nonfinite == "raise" and not torch.compiler.is_compiling() and has_values(image)
 
     def _look_at_range(self, test: Tensor, reference: Tensor) -> None:
-        """Warn at the first call where values are no sRGB codes, but bytes or in [-1, 1]."""
+        """Warn at the first call if values are not sRGB codes, but bytes or in [-1, 1]."""
         if self._range_is_known or self.display.encoding != "srgb" or not can_be_read(test):
             return
         self._range_is_known = True

@@ -1,16 +1,16 @@
 """What a pair of images calls for: what can be left out without a difference that counts.
 
-Only what is proven is left out: the map changes by rounding alone.
+Only what provably makes no difference is left out: the map changes by rounding only.
 
 - **Equal images.** The map is exactly 0 (`torch_vdm.model.level`: each image takes the same path).
 - **Equal regions.** Where the two are equal in a pixel and so far around it that no filter, no
-  pooling and no parent's share sees a difference, the map is exactly 0
-  (`torch_vdm.model.charging`): the finest levels are computed where the images differ alone, the
-  coarse ones from the whole images, of which the second has the first's nodes wherever they are
-  equal. With an observer whose coarse differences are charged, and where contrast sensitivity is of
-  levels.
-- **Grey images.** Of light with one colour the three cones' responses are one plane times three
-  numbers, before and behind every linear step, and so are their details: one plane is decomposed,
+  pooling and no parent's share has a difference, the map is exactly 0
+  (`torch_vdm.model.charging`). The finest levels are computed only where the images differ, the
+  coarse ones from the whole images, where the second shares the first's nodes wherever they are
+  equal. This is for an observer whose coarse differences are charged, and for contrast sensitivity
+  on the levels.
+- **Grey images.** For light of one colour the three cones' responses are one plane times three
+  numbers, before and after every linear step, and so are their details: one plane is decomposed,
   and the three channels' contrasts are its details times three weights.
 """
 
@@ -21,36 +21,36 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-# Pixels a side of the squares in which images are equal or not: as many truths as a whole number of
+# Pixels a side of the squares in which images are equal or not: as many booleans as an integer of
 # 64 bits holds.
 SQUARE = 8
 
-# Every so many rows are looked at first: where most of these differ, all are taken to.
+# The spacing of the rows that are looked at first: if most of these differ, all are taken to.
 # Status: choice.
 ROWS = 32
 
-# Regions are left out where no more than this share of the squares differs: the rest of an image
-# is computed twice along their borders. Status: choice, measured.
+# Regions are left out if no more than this share of the squares differs: the rest of an image is
+# computed twice along their borders. Status: choice, measured.
 MOST = 0.5
 
-# Smaller images, in pixels, are computed whole: there an operation costs more than its numbers.
+# Images with fewer pixels are computed whole: calling an operation costs more than its arithmetic.
 # Status: choice, measured.
 SMALLEST = 512 * 512
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What is computed of a pair of images, and what is not.
+    """What is computed for a pair of images, and what is not.
 
     Attributes
     ----------
     effects
         The names of the effects that are simulated.
     equal
-        For each batch item whether its two images are equal: its map is 0, and nothing is computed.
+        Whether each batch item's two images are equal: its map is 0, and nothing is computed.
     differing
-        For each item the squares in which its images differ, (rows, columns), of a plane of squares
-        that covers them; None where all of it is computed.
+        For each item, the squares in which its images differ, (rows, columns), in a plane of
+        squares that covers them; None if all of it is computed.
     square
         Pixels a side of a square.
     grey
@@ -69,7 +69,7 @@ class Plan:
         return not (self.grey or any(self.equal) or any(d is not None for d in self.differing))
 
     def reasons(self) -> list[str]:
-        """Return what is left out and why, a sentence each; none where nothing is."""
+        """Return what is left out and why, one sentence each; none if nothing is."""
         found = []
         if any(self.equal):
             which = _items(self.equal)
@@ -101,7 +101,7 @@ class Plan:
 
 
 def everything(effects: tuple[str, ...], items: int) -> Plan:
-    """Return the plan that leaves nothing out of so many pairs."""
+    """Return the plan that leaves nothing out, for so many pairs."""
     return Plan(effects, (False,) * items, (None,) * items, SQUARE, grey=False)
 
 
@@ -128,7 +128,7 @@ def _few(squares: Tensor, image: Tensor) -> bool:
 
 
 def _differing(test: Tensor, reference: Tensor) -> Tensor | None:
-    """Return the squares in which two images (1, 3, H, W) differ; None where most rows do."""
+    """Return the squares in which two images (1, 3, H, W) differ; None if most rows do."""
     some = (test[..., ::ROWS, :] != reference[..., ::ROWS, :]).any(1)
     if float(some.float().mean()) > MOST:
         return None
@@ -137,12 +137,12 @@ def _differing(test: Tensor, reference: Tensor) -> Tensor | None:
     height, width = differ.shape
     down, across = -(-height // SQUARE), -(-width // SQUARE)
     whole = functional.pad(differ, (0, across * SQUARE - width, 0, down * SQUARE - height))
-    # Eight truths are one whole number: a test of all of them at once.
+    # Eight booleans are one integer: all of them are tested at once.
     return (whole.view(torch.int64) != 0).view(down, SQUARE, across).any(1)
 
 
 def _grey(image: Tensor) -> bool:
-    """Return whether the three channels (B, 3, H, W) are one, and nothing is below 0."""
+    """Return whether the three channels (B, 3, H, W) are equal, and nothing is below 0."""
     red, green, blue = image.unbind(1)
     for rows in (slice(None, None, ROWS), slice(None)):
         first = red[:, rows]

@@ -18,22 +18,22 @@ from torch_vdm.run.tiling import Source, read
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
-# What a heat map's colours are cut at where the largest difference is smaller, in JND, so that
-# invisible differences look like nothing. Status: choice.
+# The least upper end of a heat map's colour scale, in JND, so that invisible differences look like
+# nothing. Status: choice.
 SMALLEST_SCALE = 2.0
 
-# Pixels of a map that are taken at once, and a side of a picture in a heat map, in pixels: more
-# would not be seen. Status: choice.
+# Pixels of a map that are processed at once, and the largest side of a panel in a heat map, in
+# pixels: more would not be seen. Status: choice.
 BAND = 2**22
 LARGEST_PANEL = 1200
 
-# Images that are longer for their height, or higher, are drawn wider: a line shows nothing.
+# Images with a larger aspect ratio, wide or tall, are stretched: a line shows nothing.
 # Status: choice.
 LONGEST = 16
 
 
 class Figures(TypedDict):
-    """The figures of a map, JND."""
+    """The figures of a map, in JND."""
 
     max_jnd: float
     max_pixel: tuple[int, int]
@@ -46,8 +46,8 @@ class Figures(TypedDict):
 class Comparison:
     """The figures of one comparison; the fields of the JSON file.
 
-    JND figures are of the map: its maximum and where it is (x, y), mean and 95th percentile, and
-    the share of pixels over 1 JND. ``score_jnd`` is that of `VDM.score`, the maximum again.
+    JND figures are those of the map: its maximum and where it is (x, y), mean and 95th percentile,
+    and the share of pixels over 1 JND. ``score_jnd`` is that of `VDM.score`, the maximum again.
     ``mean_luminance_change`` is relative to the reference: -0.1 is 10 % darker; None against a
     black reference. ``left_out``: what was not computed, and why it changes no figure.
     ``seconds`` is the metric's own time.
@@ -113,9 +113,9 @@ def figures(jnd: Tensor) -> Figures:
 
 
 def _ranked(bands: Sequence[Tensor], rank: int) -> float:
-    """Return the value of a rank, from 1 on, of values of 0 or more in float32.
+    """Return the value of a rank, counted from 1, among values of 0 or more in float32.
 
-    Such numbers are ordered as their bits are: the upper half of these is found first, then the
+    Such numbers are ordered like their bits: the upper half of these is found first, then the
     lower.
     """
     chosen, half = 0, 2**16
@@ -133,7 +133,7 @@ def _ranked(bands: Sequence[Tensor], rank: int) -> float:
 
 
 def shrunk(source: Source) -> Tensor:
-    """Return an image (3, H, W) small enough for a picture of it: means of blocks of pixels."""
+    """Return an image (3, H, W) reduced to fit a panel: means of blocks of pixels."""
     height, width = source.shape[-2:]
     block = -(-height // LARGEST_PANEL), -(-width // LARGEST_PANEL)
     rows = block[0] * max(1, BAND // (block[0] * width))
@@ -150,7 +150,7 @@ def shrunk(source: Source) -> Tensor:
 
 
 def _shrunk_map(jnd: Tensor) -> Tensor:
-    """Return a map (H, W) small enough for a picture of it: maxima of blocks of pixels."""
+    """Return a map (H, W) reduced to fit a panel: maxima of blocks of pixels."""
     height, width = jnd.shape
     block = -(-height // LARGEST_PANEL), -(-width // LARGEST_PANEL)
     bands = jnd.split(block[0] * max(1, BAND // (block[0] * width)))
@@ -161,10 +161,10 @@ def _shrunk_map(jnd: Tensor) -> Tensor:
 
 
 def plain_console(text: TextIO, width: int) -> "Console":
-    """Return a console that writes to ``text`` for the terminal, as if it had ``width`` at least.
+    """Return a console that writes to ``text`` as for a terminal at least ``width`` wide.
 
-    Plain text: nothing in a path is markup, and no number is coloured. Too narrow a terminal wraps
-    lines; a table cut to its width would lose figures.
+    The text is plain: nothing in a path is markup, and no number is coloured. A terminal that is
+    too narrow wraps lines; a table cut to its width would lose figures.
     """
     from rich.console import Console
 
@@ -181,7 +181,7 @@ def plain_console(text: TextIO, width: int) -> "Console":
 
 @contextmanager
 def progress(what: str, count: int) -> Iterator[Callable[[], None]]:
-    """Show a bar with the time left on a terminal; yield what moves it on by one."""
+    """Show a bar with the time left on a terminal; yield a function that moves it on by one."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
@@ -245,7 +245,7 @@ def write_heat_map(path: Path, reference: Tensor, test: Tensor, jnd: Tensor, tit
     jnd
         (H, W), of any size.
     title
-        One line over the picture.
+        One line above the picture.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -24,9 +24,10 @@ from torch_vdm.options import switch
 from torch_vdm.pair import Nonfinite, PairMetric
 from torch_vdm.run.schedule import Schedule
 
-# Line spread of the eye, the sum of weight exp(-decay x^2) and weight exp(-decay abs(x)), x in
-# minutes of arc. Source: Westheimer 1986. Status: source. Beyond RADIUS it is under 1/1000 of its
-# peak. Applied along rows and columns, which is exact for gratings along them. Status: choice.
+# Line spread function of the eye, the sum of weight exp(-decay x^2) and weight exp(-decay abs(x)),
+# x in minutes of arc. Source: Westheimer 1986. Status: source. Beyond RADIUS it is under 1/1000 of
+# its peak. It is applied along rows and columns, which is exact for gratings along them. Status:
+# choice.
 GAUSSIAN_WEIGHT, GAUSSIAN_DECAY = 0.47, 3.3
 EXPONENTIAL_WEIGHT, EXPONENTIAL_DECAY = 0.53, 0.93
 RADIUS = 7.0
@@ -37,33 +38,33 @@ MOSAIC = 120.0
 # Octaves of the pyramid. Status: recalled.
 OCTAVES = 7
 
-# Frequency of a band in cycles per sample: 32 cycles/degree on the finest of the mosaic. Status:
+# Frequency of a band in cycles per sample: 32 cycles/degree for the finest on the mosaic. Status:
 # recalled (32, 16 ... 0.5 cycles/degree).
 BAND = 32.0 / 120.0
 
-# What the eye is adapted to, in cd/m2, and the size of Barten's target, in degrees: those of the
-# paper's observer. The eye's own light, which only keeps a division by 0 finite. Status: choice.
+# The adaptation luminance in cd/m2 and the size of Barten's target in degrees, those of the paper's
+# observer; and the eye's own light, which only keeps a division by 0 finite. Status: choice.
 ADAPTATION, SIZE, DARK_LIGHT = 100.0, 12.0, 1e-4
 
-# Contrasts are held to this: values that are no light have no bound. Status: choice.
+# Contrasts are clamped to this: values that are not light have no bound. Status: choice.
 LARGEST = 1e10
 
 # Exponent of the distance summation. Status: recalled, and printed in Eq. 5 of the paper.
 EXPONENT = 2.4
 
-# Planes with more numbers are filtered in bands of rows, which stay in the processor's cache.
+# Planes with more elements are filtered in bands of rows, which stay in the processor's cache.
 # Status: choice, measured.
 LARGEST_AT_ONCE = 2**17
 
-# Of the oriented filters at a band's own frequency, so that a grating of it has no phase in the
-# energy.
+# The gains of the oriented filters at a band's own frequency, so that the energy of a grating of
+# that frequency does not depend on phase.
 EVEN_GAIN, ODD_GAIN = oriented.even_gain(BAND), oriented.odd_gain(BAND)
 
 
 class Sarnoff(PairMetric):
-    """The Sarnoff visual discrimination model, of luminance.
+    """The Sarnoff visual discrimination model, for luminance.
 
-    Called like `VDM`: (B, 3, H, W) twice to the map of visible differences (B, 1, H, W) in
+    It is called like `VDM`: (B, 3, H, W) twice give the map of visible differences (B, 1, H, W) in
     just-noticeable differences.
 
     Parameters
@@ -81,7 +82,7 @@ class Sarnoff(PairMetric):
     Raises
     ------
     ValueError
-        Where a parameter or an image is not as stated.
+        If a parameter or an image is not as stated.
     """
 
     def __init__(
@@ -128,11 +129,11 @@ class Sarnoff(PairMetric):
     def _sensitivities(self) -> list[float]:
         """Return the weight of every band, the finest first.
 
-        Such that a grating of its frequency, at the contrast that Barten's formula calls threshold,
-        has an energy of 1: his sensitivity over what the optics and the pyramid leave of the
-        grating. What aliases in the pyramid and what resampling blurs is not counted.
+        With these, a grating of a band's frequency, at the threshold contrast of Barten's formula,
+        has an energy of 1: a weight is his sensitivity over what the optics and the pyramid leave
+        of the grating. Aliasing in the pyramid and blur by resampling are not counted.
         """
-        # On the processor, whatever the default device is: read back at once.
+        # On the CPU, whatever the default device is: it is read back at once.
         exact = partial(torch.tensor, dtype=torch.float64, device="cpu")
         luminance, size = exact(ADAPTATION), exact(SIZE)
         weights = []
@@ -213,12 +214,12 @@ class Sarnoff(PairMetric):
     ) -> Tensor:
         if not self.resample or plane.shape[-2:] == size:
             return plane
-        # Linear, for the map must not fall below 0.
+        # Linear, because the map must not fall below 0.
         return functional.interpolate(plane, size, mode="bilinear", antialias=True)
 
 
 def _line_spread(ppd: float) -> tuple[float, ...]:
-    """Return the weights of the eye's line spread at the pixels, of sum 1."""
+    """Return the weights of the eye's line spread function at the pixels, with a sum of 1."""
     reach = math.ceil(RADIUS * ppd / 60.0)
     minutes = [60.0 * tap / ppd for tap in range(-reach, reach + 1)]
     spread = [
@@ -274,9 +275,9 @@ def _response_difference(
 
 
 def _pooled_difference(difference: Tensor, exponent: Tensor) -> Tensor:
-    """Return the local visual difference, pooled: by its difference, for pooling is linear.
+    """Return the local visual difference; the difference is pooled, because pooling is linear.
 
-    The mean of a disc 5 wide, its 21 samples of equal weight: choice.
+    Pooling is the mean over a disc 5 wide, with its 21 samples of equal weight: choice.
     """
     padded = _surround(difference, 2)
     length = difference.shape[-2]

@@ -1,4 +1,4 @@
-"""The visual difference metric as a module: its options, and what it is asked for."""
+"""The visual difference metric as a module: its options and its methods."""
 
 from collections.abc import Callable, Iterator
 from typing import Any, Literal, Self
@@ -30,7 +30,7 @@ from torch_vdm.run.tiles import Done, Progress, in_tiles
 from torch_vdm.run.tiling import TILE, Source, check_sources, read
 from torch_vdm.sarnoff import Sarnoff
 
-# The exponent of the summation whose power of an energy is a cube: the calibrated observer's.
+# The summation exponent with which energies are cubed: the calibrated observer's.
 CUBES = 6.0
 
 
@@ -41,9 +41,9 @@ class VDM(PairMetric):
     visible differences, (B, 1, H, W) in just-noticeable differences: 1 is just noticeable. The
     order of the two makes no difference, and equal images give exactly 0.
 
-    It computes in float64 where an input is float64, else in float32, under autocast too. Its
+    It computes in float64 if an input is float64, otherwise in float32, also under autocast. Its
     constants follow from its options: they move with the module, keep their precision through
-    `half()` and the like, and are no part of its state dict.
+    `half()` and the like, and are not part of its state dict.
 
     Parameters
     ----------
@@ -52,28 +52,28 @@ class VDM(PairMetric):
     display
         What the pixel values are; `Display.srgb()` by default.
     observer
-        Who looks; `Observer.calibrated()` by default, and that one with what was fitted with the
-        transform.
+        Who looks; `Observer.calibrated()` by default, which takes the numbers that were fitted with
+        the transform.
     transform
         How the image is decomposed: `Haar()`, the default, `StationaryHaar()` or `Steerable()`.
     effects
-        What is simulated. "auto", the default: everything, and what a pair does not call for is
-        not computed, see `plan`. "full": all of it is. Or an `Effects`.
+        What is simulated. "auto", the default: everything, except that what a pair does not need is
+        not computed, see `plan`. "full": all of it is computed. Or an `Effects`.
     nonfinite
         "raise": NaN or infinity in an image is a ValueError that names the batch item (a graph
-        of torch.export cannot raise: there it gives NaN). To know, one number an image is read
-        back from the device, and one of a mask of `VDMLoss`. "mask": such pixels are taken as equal
-        in both images, with the value that one of them has, or else that of their surroundings,
-        and the map is 0 there; nothing is read back. In both cases the first call reads once more:
-        values that are no sRGB codes, where the display takes these, are told by a warning.
+        of torch.export cannot raise: there it gives NaN). For this, one number per image is read
+        back from the device, and one for a mask of `VDMLoss`. "mask": such pixels are taken as
+        equal in both images, with the value that one of them has, or otherwise that of their
+        surroundings, and the map is 0 there; nothing is read back. In both cases the first call
+        reads once more, to warn of values that are not sRGB codes where the display expects these.
     schedule
-        How it is computed, which changes no number but its last bits; by default chosen for each
+        How it is computed, which changes only the last bits of results; by default chosen for each
         pair, see `scheduled`.
 
     Raises
     ------
     ValueError
-        Where a parameter or an image is not as stated.
+        If a parameter or an image is not as stated.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class VDM(PairMetric):
             "luminance_of_cones": np.linalg.inv(XYZ_TO_SML)[1:2].tolist(),
             "dark_cones": [self.observer.dark_light * sum(row) for row in XYZ_TO_SML],
             "frequencies": [[self.ppd * frequency for frequency, _ in level] for level in peaks],
-            # Without them the orientations keep what they have to one another.
+            # Without level gains the orientations keep their gains relative to one another.
             "gains": [
                 [gain if self.observer.level_gain else gain / level[0][1] for _, gain in level]
                 for level in peaks
@@ -155,7 +155,7 @@ class VDM(PairMetric):
         )
 
     def model(self, dtype: torch.dtype, steps: Steps | None = None, grey: bool = False) -> Model:
-        """Return what is computed, with constants of a precision; see `torch_vdm.model.model`."""
+        """Return the model with constants of a precision; see `torch_vdm.model.model`."""
         return Model(
             self.display,
             self.observer,
@@ -168,10 +168,10 @@ class VDM(PairMetric):
         )
 
     def plan(self, test: Tensor, reference: Tensor) -> Plan:
-        """Return what is computed of a pair, (B, 3, H, W) twice, and what is left out, and why.
+        """Return what is computed for a pair, (B, 3, H, W) twice, and what is left out, and why.
 
-        What is left out changes the map by rounding alone. It is planned on the processor, where no
-        gradient and no compiled code is asked for, and where numbers may be read.
+        What is left out changes the map by rounding only. Something is left out only on the CPU,
+        without gradients or compiled code, and where values may be read.
         """
         test, reference, _ = self._checked(test, reference)
         return self._plan(test, reference)
@@ -186,12 +186,12 @@ class VDM(PairMetric):
         return plan_of(test, reference, names, may)
 
     def scheduled(self, test: Tensor, reference: Tensor) -> Schedule:
-        """Return how a pair, (B, 3, H, W) twice, is computed: what `repr` prints of it."""
+        """Return how a pair, (B, 3, H, W) twice, is computed; `repr` shows it."""
         return self.schedule or chosen(self._job(test, reference))
 
     @property
     def _schedule(self) -> Schedule:
-        """How what is no pair of images is computed."""
+        """How anything other than a pair of images is computed."""
         compiled = self._compiles and not torch.compiler.is_compiling()
         return self.schedule or Schedule(compiled=compiled)
 
@@ -204,7 +204,7 @@ class VDM(PairMetric):
         items = zip(test.split(1), reference.split(1), plan.differing, strict=True)
         return torch.cat(
             [
-                # An image's own power beside itself is 0 in every pixel.
+                # The power of an image against itself is 0 in every pixel.
                 model.nothing(one)
                 if same
                 else self._executed(model, schedule, one, other, some, plan.square)
@@ -242,54 +242,54 @@ class VDM(PairMetric):
     def represent(self, image: Tensor) -> Cortex:
         """Return the cortex representation of an image: display, cones, transform.
 
-        ``image`` is (B, 3, H, W), as the display expects it; of half precision in float32.
+        ``image`` is (B, 3, H, W), as the display expects it; half precision becomes float32.
         """
         self._require_image("an image", image)
         image = image.to(torch.promote_types(image.dtype, torch.float32)).contiguous()
         return self.model(image.dtype).represent(image)
 
     def respond(self, cortex: Cortex) -> tuple[Tensor, ...]:
-        """Return the responses of one image: chromatic aberration to the transducer.
+        """Return the responses of one image, from chromatic aberration to the transducer.
 
-        One (B, channels, orientations, h, w) a level, level 0 first; 1 is threshold. Those of a
-        signed observer are weighted contrasts: what masks them is of the other image too.
+        There is one (B, channels, orientations, h, w) per level, level 0 first; 1 is threshold.
+        Those of a signed observer are weighted contrasts: their masking involves the other image.
         """
         return self.model(cortex.mean.dtype).responses(cortex)
 
     def lowpass_difference(self, first: Cortex, second: Cortex) -> Tensor:
         """Return the weighted contrast between the means of two images, the lowpass term.
 
-        (B, channels, 1, 1), not negative, 1 at threshold; 0 for an observer that never compares
-        them. A uniform change is seen here and nowhere else.
+        It is (B, channels, 1, 1), not negative, 1 at threshold; and 0 for an observer that never
+        compares them. A uniform change is seen here and nowhere else.
         """
         return self.model(first.mean.dtype).lowpass_difference(first, second)
 
     def local_differences(self, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
-        """Return the local visual difference of every node (Eq. 5), before the root.
+        """Return the local visual difference of every node (Eq. 5), before the root is taken.
 
-        One (B, 1, h, w) a level, level 0 first.
+        There is one (B, 1, h, w) per level, level 0 first.
         """
         schedule = self._schedule
         model = self.model(first.mean.dtype, schedule)
         return whole.local_differences(model, schedule, first, second)
 
     def compare(self, first: Cortex, second: Cortex) -> Tensor:
-        """Return the accumulated differences of two representations, before the root.
+        """Return the accumulated differences of two representations, before the root is taken.
 
-        (B, 1, h, w) of the finest level. The responses of a level are taken and dropped one
-        level at a time, which bounds memory.
+        They are (B, 1, h, w), of the finest level. Responses are computed and dropped one level at
+        a time, which bounds memory.
         """
         schedule = self._schedule
         return whole.compared(self.model(first.mean.dtype, schedule), schedule, first, second)
 
     def beside(self, first: Cortex) -> Callable[[Cortex], Tensor]:
-        """Return `compare` with a first representation that stays, whose responses are taken once.
+        """Return `compare` with a fixed first representation, whose responses are computed once.
 
-        Nor is the eye's adaptation found anew for one that has the windows of the first. It may
-        stand for a batch of others, (1, ...) beside (B, ...), but not for images below one
-        another. Nearly half of the time where many are compared with one; in the last bits other
-        numbers than `compare`. Coarse differences are charged to all pixels below them: where the
-        largest of the map is wanted, of noise that is everywhere, it is the same.
+        The eye's adaptation is not computed again for a second one with the windows of the first.
+        The first may serve a batch of others, (1, ...) against (B, ...), but not images stacked
+        vertically. It nearly halves the time when many are compared with one; the last bits differ
+        from `compare`. Coarse differences are charged to all pixels below them, which makes no
+        difference to the largest value of the map for noise that is everywhere.
         """
         model = self.model(first.mean.dtype)
         sights = model.adaptation(first)
@@ -317,25 +317,25 @@ class VDM(PairMetric):
         out: Tensor | None = None,
         progress: Progress | None = None,
     ) -> Tensor:
-        """Return the map of images that may be larger than memory: that of the whole, to rounding.
+        """Return the map of images that may be larger than memory, the same up to rounding.
 
         Levels up to the size of a tile are computed tile by tile, coarser ones once, from the
         lowpass pyramid of the whole images, which is read first: so the images are read twice, and
-        little more than the map and one tile is in memory. Behind a filter they are read once more,
-        for what is coarser than a tile is filtered first. Without gradients.
+        little more than the map and one tile is in memory. With a filter they are read once more,
+        because what is coarser than a tile is filtered first. There are no gradients.
 
         Parameters
         ----------
         test, reference
-            (3, H, W) or (B, 3, H, W): tensors, or what is read part by part; see
-            `torch_vdm.run.tiling.Source`. Whole numbers of 8 and 16 bits stand for 0 to 1.
+            (3, H, W) or (B, 3, H, W): tensors, or sources that are read part by part; see
+            `torch_vdm.run.tiling.Source`. Integers of 8 and 16 bits stand for 0 to 1.
         tile
             Pixels a side of a tile, 4 or more; rounded down to a multiple of what its levels need.
         out
-            Where the map goes, for example a tensor over a memory-mapped file: (1, H, W) or
+            Where the map is written, for example a tensor over a memory-mapped file: (1, H, W) or
             (B, 1, H, W), floating point. By default a new tensor in memory.
         progress
-            Called after each step with the number of steps done and of all.
+            Called after each step with the number of steps done and the number of all steps.
 
         Returns
         -------
@@ -345,7 +345,7 @@ class VDM(PairMetric):
         Raises
         ------
         ValueError
-            Where a parameter or an image is not as stated; ``out`` then has what was done.
+            If a parameter or an image is not as stated; ``out`` then holds what was done.
         """
         items, size = check_sources(test, reference)
         shape = (*test.shape[:-3], 1, *size)
@@ -373,7 +373,7 @@ class VDM(PairMetric):
     ) -> Tensor:
         """Return the largest value of each item's map, (B,), JND, and keep no map.
 
-        That of the whole images, to rounding; arguments as `tiled`.
+        It is that of the whole images up to rounding; arguments as in `tiled`.
         """
         items, _ = check_sources(test, reference)
         largest: list[list[Tensor]] = [[] for _ in range(items)]

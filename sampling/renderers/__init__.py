@@ -1,4 +1,4 @@
-"""What the sampler renders with."""
+"""The renderers that the sampler draws from."""
 
 from sampling.renderers.protocol import Renderer, Samples
 

@@ -1,15 +1,15 @@
-"""Mitsuba's path tracer in Python, which tells the light of short paths by itself.
+"""Mitsuba's path tracer in Python, which also returns the light of short paths by itself.
 
-The same estimator as ``path``, drawn with the same random numbers in the same order, so that every
-sample is what ``path`` gives, bit for bit; and what it was before its path went on past a depth is
-what ``path`` gives with that as its ``max_depth``. So one pass tells what further bounces add.
+It is the same estimator as ``path``, with the same random numbers in the same order, so that every
+sample is that of ``path``, bit for bit; and its light up to a given depth is that of ``path`` with
+this ``max_depth``. So one pass measures what further bounces add.
 
-It is handed Mitsuba's module: `sampling.renderers.mitsuba` alone imports it.
+Mitsuba's module is passed in: `sampling.renderers.mitsuba` alone imports it.
 """
 
 from typing import Any
 
-# Most that a path goes on with, and the rest of Russian roulette. Status: source, Mitsuba's `path`.
+# Largest survival probability in Russian roulette. Status: source, Mitsuba's `path`.
 LIKELIEST = 0.95
 
 # Mitsuba's `max_depth` where there is no limit.
@@ -17,19 +17,19 @@ NO_LIMIT = 2**32 - 1
 
 
 def make(mi: Any, dr: Any, max_depth: int | None, rr_depth: int, cut: int) -> Any:
-    """Return the integrator for the variant of Mitsuba that is set.
+    """Return the integrator for the active variant of Mitsuba.
 
-    Its AOVs are the light of no more than ``cut`` path segments, R, G, B, and how many segments
-    were looked for. Emitters are visible, and there are no media.
+    Its AOVs are the light of paths of at most ``cut`` segments, R, G, B, and how many segments were
+    traced. Emitters are visible, and there are no media.
 
     Parameters
     ----------
     mi, dr
         Mitsuba and Dr.Jit.
     max_depth, rr_depth
-        As those of ``path``; None: no limit.
+        As in ``path``; None: no limit.
     cut
-        Path segments, at least 1. Another number is no other code: nothing is compiled anew.
+        Path segments, at least 1. Another number needs no recompilation.
     """
     base: Any = mi.SamplingIntegrator
     most = NO_LIMIT if max_depth is None else max_depth
@@ -42,11 +42,11 @@ def make(mi: Any, dr: Any, max_depth: int | None, rr_depth: int, cut: int) -> An
         weight = own / (own + other)
         return dr.select(dr.isfinite(weight), weight, 0.0)
 
-    class Bounces(base):  # type: ignore[misc]  # its base is known when Mitsuba is
-        """Paths, and what each would be were it shorter."""
+    class Bounces(base):  # type: ignore[misc]  # its base is known once Mitsuba is loaded
+        """Traces paths, and returns what each would be if it were shorter."""
 
         def aov_names(self) -> list[str]:
-            """Return the names of what it gives beside the light."""
+            """Return the names of the AOVs."""
             return ["short.R", "short.G", "short.B", "segments"]
 
         def sample(
@@ -77,7 +77,7 @@ def make(mi: Any, dr: Any, max_depth: int | None, rr_depth: int, cut: int) -> An
                 sampler: Any,
                 short: Any,
             ) -> tuple[Any, ...]:
-                """Follow paths by one segment; each operation as and where ``path`` has it."""
+                """Extend paths by one segment; each operation as and where ``path`` has it."""
                 segments += 1
                 surface = scene.ray_intersect(
                     ray, ray_flags=+mi.RayFlags.All, coherent=depth == 0, active=active
@@ -89,7 +89,7 @@ def make(mi: Any, dr: Any, max_depth: int | None, rr_depth: int, cut: int) -> An
                 light = dr.fma(throughput, emitted * share(density, other), light)
                 short = dr.select(depth + 1 <= longest, light, short)
                 onwards = active & (depth + 1 < most) & surface.is_valid()
-                # Light that was aimed at: a path of depth + 2 segments.
+                # Emitter sampling: a path of depth + 2 segments.
                 bsdf = surface.bsdf(ray)
                 aimed = onwards & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
                 met, weight = scene.sample_emitter_direction(
@@ -104,7 +104,7 @@ def make(mi: Any, dr: Any, max_depth: int | None, rr_depth: int, cut: int) -> An
                 part = dr.select(met.delta, 1.0, share(met.pdf, other))
                 light = dr.select(aimed, dr.fma(throughput, value * weight * part, light), light)
                 short = dr.select(depth + 2 <= longest, light, short)
-                # On.
+                # The next segment.
                 away = surface.spawn_ray(surface.to_world(bounce.wo))
                 ray = dr.select(active, away, ray)
                 throughput = throughput * reflected

@@ -1,12 +1,12 @@
 """Where in a pixel's neighbourhood a sample falls: filter importance sampling.
 
 A film's reconstruction filter weights what a pixel sees around its centre, and Mitsuba's own
-render adds each sample to every pixel that its filter reaches: neighbours share samples, and their
-noise. Here the place of each sample is drawn from the filter instead, so that the samples of all
-pixels stay independent, as the statistics, and denoisers, take them to be; the expectation is the
-same (Ernst, Stamminger and Greiner 2006).
+render adds each sample to every pixel within the filter's radius: neighbours share samples and
+their noise. Here the place of each sample is drawn from the filter instead, so that the samples of
+all pixels stay independent, as the statistics and denoisers assume; the expectation is the same
+(Ernst, Stamminger and Greiner 2006).
 
-It is handed Mitsuba's module: `sampling.renderers.mitsuba` alone imports it.
+Mitsuba's module is passed in: `sampling.renderers.mitsuba` alone imports it.
 """
 
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# Mitsuba's filters by the names of their classes; these names are what ``--filter`` takes.
+# Mitsuba's filters by the names of their classes; the values are those of ``--filter``.
 NAMES = {
     "BoxFilter": "box",
     "TentFilter": "tent",
@@ -29,22 +29,22 @@ SCENE = "scene"
 
 FILTERS = (SCENE, *NAMES.values())
 
-# Pieces of a pixel, in each of which the filter is taken as linear; even, for the borders of
+# Pieces of a pixel, in each of which the filter is taken as linear; even, because the borders of
 # pixels lie half a pixel from their centres. Status: choice; the densities of Mitsuba's filters
-# are then off by 1e-4 of their peak at most.
+# are then off by at most 1e-4 of their peak.
 PIECES = 64
 
-# The share of the radius by which its end is looked at from inside, where a filter may end in a
+# How far inside its radius, as a share of it, the end of a filter is evaluated: it may end in a
 # step. Status: choice.
 INSIDE = 1e-6
 
-# The share of the filter's peak below which it is taken as 0: an integer's sine is none in single
-# precision. Status: choice.
+# The share of the filter's peak below which it is taken as 0: a sinc is not exactly 0 at integers
+# in single precision. Status: choice.
 NOTHING = 1e-6
 
 
 class Place(NamedTuple):
-    """Where in the film samples fall, in pixels from its crop's corner, and what they count."""
+    """Where in the film samples fall, in pixels from its crop's corner, and their weights."""
 
     x: Any
     y: Any
@@ -53,34 +53,34 @@ class Place(NamedTuple):
 
 
 class PixelFilter:
-    """A reconstruction filter, to draw places from.
+    """A reconstruction filter from which the places of samples are drawn.
 
-    A filter with negative lobes takes two rays a sample, along which the random numbers are the
-    same: the place of one is drawn from where the filter is positive, that of the other from where
-    it is negative, and the other is taken off. One ray with a sign would be noise of its own where
-    the picture is even.
+    A filter with negative lobes takes two rays per sample, with the same random numbers: the place
+    of one is drawn from where the filter is positive, that of the other from where it is negative,
+    and the second is subtracted. One ray with a random sign would add noise where the picture is
+    uniform.
 
     At the film's border Mitsuba divides by the weights of what was sampled, and nothing is sampled
-    outside the crop unless the film's ``sample_border`` is set: there the filter is cut off, and
-    what is left of it stands for the whole.
+    outside the crop unless the film's ``sample_border`` is set: there the filter is truncated and
+    renormalized.
 
     Parameters
     ----------
     mi, dr
-        Mitsuba, with its variant, and Dr.Jit.
+        Mitsuba, with a variant set, and Dr.Jit.
     film
-        The film at whose crop's border the filter is cut off.
+        The film; the filter is truncated at the border of its crop.
     rfilter
         The filter, separable as all of Mitsuba's are.
 
     Attributes
     ----------
     name
-        One of `NAMES`, or the class of a filter that is none of Mitsuba's.
+        One of `NAMES`, or the class of a filter that is not Mitsuba's.
     words
-        What Mitsuba says of it, with its parameters.
+        Mitsuba's description of it, with its parameters.
     rays
-        How many each sample takes: 1, or 2 where the filter has negative lobes.
+        Rays per sample: 1, or 2 where the filter has negative lobes.
     """
 
     def __init__(self, mi: Any, dr: Any, film: Any, rfilter: Any) -> None:
@@ -89,7 +89,7 @@ class PixelFilter:
         self.words = " ".join(str(rfilter).split())
         self.rays = 1
         self._mi, self._dr = mi, dr
-        # Any place of the pixel, and no table.
+        # Uniform over the pixel, without a table.
         self._box: bool = self.name == "box" and rfilter.radius() == 0.5
         if self._box:
             return
@@ -116,11 +116,11 @@ class PixelFilter:
         Parameters
         ----------
         sampler
-            Gives the random numbers: two, after one more where a sample takes two rays.
+            Returns the random numbers: two, preceded by one more where a sample takes two rays.
         x, y
             Column and row in the crop, integers of the variant.
         negative
-            Whether the ray is the one that is taken off; without meaning where there is but one.
+            Whether the ray is the one to subtract; ignored where there is only one.
         """
         mi, dr = self._mi, self._dr
         if self._box:
@@ -141,7 +141,7 @@ class PixelFilter:
             for lobes in (columns, rows)
         ]
         (px, nx), (py, ny) = areas
-        # The product is positive where both are, or neither is, and negative where one of them is.
+        # The product is positive where both factors have the same sign, negative where they differ.
         one = px * dr.select(negative, ny, py)
         all_of_it = one + nx * dr.select(negative, py, ny)
         positive_x = choice * all_of_it < one
@@ -157,12 +157,12 @@ class PixelFilter:
         return Place(centre_x + apart_x, centre_y + apart_y, weight)
 
     def _inside(self, lobe: int, shares: Any, u: Any) -> Any:
-        """Return the place, from the centre, below which a share ``u`` of what is left lies."""
+        """Return the offset from the centre below which a share ``u`` of the cut lobe lies."""
         begin, share = shares[lobe]
         return self._lobes[lobe].sample(begin + u * share)
 
     def _plane(self, numbers: NDArray[np.float64]) -> Any:
-        """Return numbers as the variant has them."""
+        """Return numbers in the variant's type."""
         number = self._mi.Float
         return numbers.tolist() if number is float else number(numbers.astype(np.float32))
 
@@ -173,7 +173,7 @@ class PixelFilter:
 
 
 def _linear_pieces(mi: Any, rfilter: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where the pieces of a filter end, in pixels, and its values there, 0 among them."""
+    """Return the ends of a filter's linear pieces, its zeros included, and its values there."""
     radius = float(rfilter.radius())
     inner = np.arange(-int(radius * PIECES), int(radius * PIECES) + 1) / PIECES
     nodes = np.union1d(inner[np.abs(inner) < radius], [-radius, radius])
@@ -207,12 +207,12 @@ def _area(nodes: NDArray[np.float64], lobe: NDArray[np.float64]) -> NDArray[np.f
 def _shares(
     nodes: NDArray[np.float64], lobe: NDArray[np.float64], length: int, cut: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return which share of a lobe lies before the film, and which inside, for each pixel."""
+    """Return the shares of a lobe that lie before the film and inside it, for each pixel."""
     area = _area(nodes, lobe)
     area /= area[-1]
     centre = np.arange(length) + 0.5
     if not cut:
         return np.zeros(length), np.ones(length)
-    # Both ends are nodes, for pixels end half a pixel from their centres.
+    # Both ends are nodes, because pixels end half a pixel from their centres.
     begin = np.interp(-centre, nodes, area)
     return begin, np.interp(length - centre, nodes, area) - begin

@@ -1,11 +1,11 @@
-"""A material of our own for Mitsuba: Lambert's, sampled uniformly over the hemisphere.
+"""A Lambertian material for Mitsuba, sampled uniformly over the hemisphere.
 
 Blind Monte Carlo as the paper describes it (Section 4.1) sends rays "at random directions". A ray
-that finds the light brings 2 rho L cos(theta) home, any other 0; how many find it depends on the
-light's solid angle alone, so that noise over light is the same wherever the whole light is seen.
-Mitsuba's own ``diffuse`` samples by the cosine, and its noise over light grows in the dark.
+that hits the light returns 2 rho L cos(theta), any other 0; how many hit it depends on the light's
+solid angle alone, so the relative noise is the same wherever the whole light is visible. Mitsuba's
+own ``diffuse`` samples by the cosine, and its relative noise grows in the dark.
 
-It is handed Mitsuba's module: `sampling.renderers.mitsuba` alone imports it.
+Mitsuba's module is passed in: `sampling.renderers.mitsuba` alone imports it.
 """
 
 from typing import Any
@@ -13,18 +13,18 @@ from typing import Any
 # Its name in a scene: <bsdf type="hemisphere">, with a texture or a colour ``reflectance``.
 NAME = "hemisphere"
 
-# Where the scene gives none, as Mitsuba's ``diffuse`` has it. Status: choice.
+# The reflectance where the scene gives none, as in Mitsuba's ``diffuse``. Status: choice.
 REFLECTANCE = 0.5
 
 
 def register(mi: Any, dr: Any) -> None:
-    """Make the material known to the variant of Mitsuba that is set."""
+    """Register the material with the active variant of Mitsuba."""
     base: Any = mi.BSDF
     warp: Any = mi.warp
     cosine: Any = mi.Frame3f.cos_theta
 
-    class Hemisphere(base):  # type: ignore[misc]  # its base is known when Mitsuba is
-        """Lambert's reflection from one side, sampled without its cosine."""
+    class Hemisphere(base):  # type: ignore[misc]  # its base is known once Mitsuba is loaded
+        """One-sided Lambertian reflection, sampled without its cosine."""
 
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
@@ -32,7 +32,7 @@ def register(mi: Any, dr: Any) -> None:
             self.m_components = [mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide]
             self.m_flags = self.m_components[0]
 
-        # The arguments that it has no use for are in Mitsuba's signatures.
+        # Unused arguments are in Mitsuba's signatures.
         def sample(
             self,
             context: Any,
@@ -41,7 +41,7 @@ def register(mi: Any, dr: Any) -> None:
             sample2: Any,
             active: Any = True,
         ) -> tuple[Any, Any]:
-            """Return a direction, and the reflected share over its density."""
+            """Return a direction, and the BSDF times its cosine over the density."""
             found = mi.BSDFSample3f()
             found.wo = warp.square_to_uniform_hemisphere(sample2)
             found.pdf = warp.square_to_uniform_hemisphere_pdf(found.wo)
@@ -58,7 +58,7 @@ def register(mi: Any, dr: Any) -> None:
             outwards: Any,
             active: Any = True,
         ) -> Any:
-            """Return rho cos(theta) / pi, 0 for what is below the surface."""
+            """Return rho cos(theta) / pi, 0 below the surface."""
             above = self._above(surface, outwards, active)
             light = self.reflectance.eval(surface, above) * (dr.inv_pi * cosine(outwards))
             return light & above
@@ -77,7 +77,7 @@ def register(mi: Any, dr: Any) -> None:
         def eval_pdf(
             self, context: Any, surface: Any, outwards: Any, active: Any = True
         ) -> tuple[Any, Any]:
-            """Return both."""
+            """Return `eval` and `pdf`."""
             return (
                 self.eval(context, surface, outwards, active),
                 self.pdf(context, surface, outwards, active),
@@ -88,7 +88,7 @@ def register(mi: Any, dr: Any) -> None:
             return self.reflectance.eval(surface, active)
 
         def traverse(self, callback: Any) -> None:
-            """Show what it is made of."""
+            """Expose the reflectance."""
             callback.put("reflectance", self.reflectance, mi.ParamFlags.Differentiable)
 
         def to_string(self) -> str:

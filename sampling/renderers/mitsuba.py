@@ -1,9 +1,9 @@
 """Mitsuba as the renderer: single pixels of a scene, sample by sample.
 
-The only file that imports mitsuba. Each sample is a ray through a place that is drawn from the
-pixel's filter, followed by the scene's own integrator; its random numbers come from the pixel, the
-number of the sample and the seed. The film and the scene's sampler are left out: samples are
-independent, as the statistics take them to be.
+This is the only file that imports mitsuba. Each sample is a ray through a place that is drawn from
+the pixel's filter, traced by the scene's own integrator; its random numbers are a function of the
+pixel, the number of the sample and the seed. The film and the scene's sampler are not used: samples
+are independent, as the statistics assume.
 """
 
 import contextlib
@@ -28,26 +28,27 @@ from sampling.renderers.needs import PATH, Needs
 from sampling.renderers.needs import read as read_needs
 from sampling.renderers.protocol import Samples
 
-# Chosen by themselves, in the order of preference; and those that follow wavelengths.
+# Variants chosen automatically, in the order of preference; and with them the spectral ones.
 RGB_VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 VARIANTS = (*RGB_VARIANTS, "cuda_ad_spectral", "llvm_ad_spectral", "scalar_spectral")
 
-# Samples in one call of the compiled variants. Speed is flat from 3e5 on, and 27 bytes are needed
-# for each. Status: choice, measured.
+# Samples in one call of the compiled variants. Speed is flat from 3e5 on, and each needs 27 bytes.
+# Status: choice, measured.
 BATCH = 2**20
 
-# Of Dr.Jit's pool: with one thread, loading a bitmap never ends. Status: measured, Mitsuba 3.9.1.
+# Fewest threads of Dr.Jit's pool: with one, loading a bitmap never ends. Status: measured, Mitsuba
+# 3.9.1.
 FEWEST_THREADS = 2
 
-# What is asked of the `aov` integrator, in its own words, and what its numbers are called.
+# The request to the `aov` integrator, in its own syntax, and the names of its channels.
 AOVS = "albedo:albedo,normal:sh_normal,depth:depth"
 AOV_NAMES = ("albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal.Z", "depth.Z")
 
-# What the share of rays that hit something is called; what stands for the integrator's own AOVs.
+# The channel of the share of rays that hit something; the value for the integrator's own AOVs.
 ALPHA, OWN = "A", "own"
 
 
-# How the names of integrators begin whose picture is black where the scene has no light.
+# How the names begin of integrators that give a black picture of a scene without lights.
 LIT = ("path", "direct", "vol")
 
 
@@ -56,42 +57,42 @@ class SceneError(ValueError):
 
 
 class Bounced(NamedTuple):
-    """Samples, and what they would be were no path longer than so many segments."""
+    """Samples, and what they would be if no path were longer than so many segments."""
 
     samples: Samples
     within: NDArray[np.float32]
     """(N, 3)."""
     segments: NDArray[np.float32]
-    """(N,), how many path segments were looked for."""
+    """(N,), how many path segments were traced."""
 
 
 class MitsubaRenderer:
-    """A scene of Mitsuba, sampled pixel by pixel; see `sampling.renderers.Renderer`.
+    """A Mitsuba scene, sampled pixel by pixel; see `sampling.renderers.Renderer`.
 
     Parameters
     ----------
     scene
         An XML file, a dict as `mi.load_dict` takes it, or an `mi.Scene`.
     parameters
-        Values for the own parameters of a scene in a file, ``<default name="..."/>``.
+        Values for a scene file's own parameters, ``<default name="..."/>``.
     sensor
         Its number, from 0 on, its id, or an `mi.Sensor`.
     seed
         0 to 2^32 - 1; other seeds give independent images.
     aov
         Whether albedo, shading normal and depth are averaged in the same pass; depth is the length
-        of the ray, in the scene's units, and 0 where it hits nothing. `OWN`: what the integrator
-        gives by itself.
+        of the ray, in the scene's units, and 0 where it hits nothing. `OWN`: the integrator's own
+        AOVs.
     integrator
         One to render with in place of the scene's own; None: its own.
     filter
-        One of `FILTERS`: the film's own, or another of Mitsuba's by name, as it is by default.
+        One of `FILTERS`: the film's own, or another of Mitsuba's by name, with its defaults.
     variant
-        One of `VARIANTS`, or "auto": that of an `mi.Scene`, for a dict the one that is set; else a
-        GPU where there is one, else compiled code where there is an LLVM, else the interpreted
-        variant, with a warning.
+        One of `VARIANTS`, or "auto": that of an `mi.Scene`, for a dict the active one; otherwise a
+        GPU if there is one, else compiled code if there is an LLVM, else the interpreted variant,
+        with a warning.
     batch
-        Samples in one call of the compiled variants; changes memory and speed, and no bit.
+        Samples in one call of the compiled variants; changes memory and speed, but no bit.
 
     Attributes
     ----------
@@ -107,12 +108,12 @@ class MitsubaRenderer:
         The filter; its ``rays`` says how many each sample takes.
     fingerprint
         A hash of the scene's file, of every file that it names, and of the parameters; empty
-        of a scene that is not in a file.
+        for a scene that is not in a file.
     planes
-        What is averaged beside the light: alpha where the film has it, then the AOVs.
+        What is averaged besides the light: alpha where the film has it, then the AOVs.
     aov_sums
         (P + 1, H W), float64: sums of the P ``planes``, and how many samples they are of; None
-        where there are none. A continued run begins with those of the run before.
+        without planes. A continued run begins with those of the earlier part.
 
     Raises
     ------
@@ -122,7 +123,7 @@ class MitsubaRenderer:
     LLVMError
         If DRJIT_LIBLLVM_PATH names a library that cannot be used.
     ValueError
-        If the seed or the filter is none.
+        If the seed or the filter is not valid.
     """
 
     def __init__(
@@ -184,7 +185,7 @@ class MitsubaRenderer:
         self._aov = aov
         own = self._integrator.aov_names()
         self.planes += own if aov == OWN else AOV_NAMES if aov else ()
-        # In what the integrator gives: where what is wanted begins, and what is told of paths.
+        # Among the integrator's AOVs: where the wanted ones begin, and those about paths.
         self._aov_at = 0 if aov == OWN else len(own)
         self._told = slice(0)
         self._with_aovs(self._integrator)
@@ -197,7 +198,7 @@ class MitsubaRenderer:
     ) -> Samples:
         """Draw samples ``first[i]`` to ``first[i] + count[i] - 1`` of each of ``pixels``.
 
-        ``pixels`` is to be sorted: neighbours are traced together.
+        ``pixels`` must be sorted: neighbours are traced together.
         """
         return self._sampled(pixels, first, count)[0]
 
@@ -208,10 +209,11 @@ class MitsubaRenderer:
         count: NDArray[np.int64],
         cut: int,
     ) -> Bounced:
-        """Draw the same samples, and tell what each is with no more path segments than ``cut``.
+        """Draw the same samples, and what each is with at most ``cut`` path segments.
 
-        Of the integrators of `Needs`, without media and in compiled RGB variants only. The samples
-        are those of ``path``, bit for bit, and the shorter ones those of ``path`` of that depth.
+        It takes the integrators of `Needs`, without media and in compiled RGB variants only. The
+        samples are those of ``path``, bit for bit, and the shorter ones those of ``path`` of that
+        depth.
         """
         before = self._integrator, self._aov_at
         needs, dr = self.needs, importlib.import_module("drjit")
@@ -229,7 +231,7 @@ class MitsubaRenderer:
         return Bounced(samples, np.stack(beside[:-1], -1), segments)
 
     def simulate(self, max_depth: int | None) -> None:
-        """Render with ``path`` of so many segments in place of the scene's own integrator."""
+        """Render with ``path`` of that depth instead of the scene's own integrator."""
         self._mi.set_variant(self.variant)
         depth = -1 if max_depth is None else max_depth
         words = {"type": PATH, "max_depth": depth, "rr_depth": self.needs.rr_depth}
@@ -238,7 +240,7 @@ class MitsubaRenderer:
         self._named = PATH, max_depth
 
     def _with_aovs(self, integrator: Any) -> None:
-        """Render with an integrator, and around it what gives the AOVs that were asked."""
+        """Render with an integrator, inside one for the AOVs that were asked for."""
         self._integrator = integrator
         if self._aov and self._aov != OWN:
             self._integrator = self._mi.load_dict(
@@ -249,7 +251,7 @@ class MitsubaRenderer:
     def _sampled(
         self, pixels: NDArray[np.int64], first: NDArray[np.int64], count: NDArray[np.int64]
     ) -> tuple[Samples, list[NDArray[np.float32]]]:
-        """Draw samples, and what is told beside the AOVs."""
+        """Draw samples, and the values about paths besides the AOVs."""
         which = np.repeat(np.asarray(pixels, np.int64), count)
         starts = np.cumsum(count) - count
         number = np.arange(len(which)) - np.repeat(starts - first, count)
@@ -258,7 +260,7 @@ class MitsubaRenderer:
             np.empty(len(which), np.float32)
             for _ in range(self._told.stop - (self._told.start or 0))
         ]
-        self._mi.set_variant(self.variant)  # someone else may have chosen another one
+        self._mi.set_variant(self.variant)  # other code may have set another one
         draw = self._draw_one_by_one if self.variant.startswith("scalar") else self._draw
         at_once = max(self._batch // self.pixel_filter.rays, 1)
         for begin in range(0, len(which), at_once):
@@ -281,7 +283,7 @@ class MitsubaRenderer:
         """Draw samples in one call of compiled code."""
         mi, dr = self._mi, importlib.import_module("drjit")
         drawn, rays = len(pixels), self.pixel_filter.rays
-        if drawn == 1:  # a width of one is compiled anew
+        if drawn == 1:  # a width of one would be recompiled
             pixels, numbers = pixels.repeat(2), numbers.repeat(2)
         ray = dr.arange(mi.UInt32, rays * len(pixels))
         pixel = mi.UInt32(pixels.astype(np.uint32).repeat(rays))
@@ -289,10 +291,10 @@ class MitsubaRenderer:
         sampler = _pixel_sampler(self.variant)
         sampler.start(pixel, number, dr.opaque(mi.UInt32, self.seed))
         width = self.size[1]
-        # Of two rays the second is taken off.
+        # Of two rays the second is subtracted.
         radiance, aovs = self._follow(sampler, pixel % width, pixel // width, (ray & 1) == 1)
         dr.eval(radiance, aovs)
-        # What is the same for all is one number.
+        # A plane that is the same for all samples is one number.
         light, *planes = (
             np.broadcast_to(plane.numpy(), (*plane.numpy().shape[:-1], rays * len(pixels)))
             for plane in (radiance, *aovs)
@@ -307,8 +309,8 @@ class MitsubaRenderer:
     ) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
         """Draw samples with the interpreted variant.
 
-        Not by rendering crops: the numbers that a pixel gets there depend on the crop and on how
-        many threads there are.
+        It does not render crops: a pixel's random numbers would then depend on the crop and on the
+        number of threads.
         """
         mi = self._mi
         sampler = mi.load_dict({"type": "independent"})
@@ -341,13 +343,13 @@ class MitsubaRenderer:
         )
         light = weight * light
         if mi.is_spectral:
-            # By the CIE curves at the wavelengths of the ray to XYZ, and from there, as films do.
+            # By the CIE curves at the ray's wavelengths to XYZ, and on to RGB, as films do.
             light = mi.spectrum_to_srgb(light, ray.wavelengths)
         planes = [mi.Float(dr.select(valid, 1.0, 0.0))] if self._alpha else []
         planes += aovs[self._aov_at :]
         planes = [plane * place.weight for plane in planes]
         for i, plane in enumerate(aovs[self._told]):
-            # Light, but for the last, which is a number.
+            # All are light but the last, which is a count.
             light_too = i < len(aovs[self._told]) - 1
             planes.append(weight[i % 3] * plane * place.weight if light_too else plane)
         return light * place.weight, planes
@@ -373,7 +375,7 @@ class MitsubaRenderer:
             )
         loaded = None if isinstance(scene, Mapping) else getattr(scene, "variant_name", None)
         if isinstance(scene, Mapping):
-            # What is in the dict may be of the variant that is set.
+            # Objects in the dict may belong to the active variant.
             mi = sys.modules.get("mitsuba")
             before = mi.variant() if mi is not None else None
             variant = before if variant == "auto" and before is not None else variant
@@ -399,7 +401,7 @@ class MitsubaRenderer:
         self._named = _innermost(str(scene.integrator()))
 
     def _chosen_sensor(self, wanted: Any) -> Any:
-        """Return the sensor of a number or an id."""
+        """Return the sensor with a number or an id."""
         sensors = self._scene.sensors()
         self.sensors = len(sensors)
         if isinstance(wanted, self._mi.Sensor):
@@ -424,7 +426,7 @@ class MitsubaRenderer:
     def _parse(self, path: Path, found: Callable[[str], Path]) -> Any:
         """Read the file and what it includes, and hash all of it.
 
-        ``found``: the file that is loaded where one is named.
+        ``found`` returns the file that is loaded for a name.
         """
         mi, parser = self._mi, self._mi.parser
         for name in ("config", "filename"):
@@ -451,7 +453,7 @@ class MitsubaRenderer:
             if _is_file(file):
                 with file.open("rb") as content:
                     digest.update(hashlib.file_digest(content, "sha256").digest())
-        # Spectra of files have been read already, and the names are gone.
+        # Spectra in files have been read already, and the files' names are gone.
         for value in values:
             if hasattr(value, "wavelengths"):
                 digest.update(np.array([value.wavelengths, value.values]).tobytes())
@@ -467,7 +469,7 @@ class MitsubaRenderer:
             raise SceneError(f"{path}: {_one_line(error)}") from error
 
     def _sampling_integrator(self, other: Any) -> Any:
-        """Return the scene's integrator, or another, if light can be asked of it ray by ray."""
+        """Return the scene's integrator, or another, if it can sample single rays."""
         mi = self._mi
         integrator = other or self._scene.integrator()
         if other is not None:
@@ -476,7 +478,7 @@ class MitsubaRenderer:
             raise SceneError(
                 f'{self.name}: expected an integrator, got none; add <integrator type="path"/>'
             )
-        # Those in Python are sampled in another way, and their base is not always loaded.
+        # Integrators in Python are sampled differently, and their base is not always loaded.
         names = {kind.__name__ for kind in type(integrator).__mro__}
         if not isinstance(integrator, mi.SamplingIntegrator) or "ADIntegrator" in names:
             raise SceneError(
@@ -551,7 +553,7 @@ def load_mitsuba(variant: str = "auto") -> Any:
         ) from error
     llvm = llvm and bool(dr.has_backend(dr.JitBackend.LLVM))
     if llvm and dr.detail.llvm_version()[0] < OLDEST:
-        # Whoever imported Mitsuba before let Dr.Jit choose for itself, once and for all.
+        # Mitsuba was imported before, and Dr.Jit chose for itself, once and for all.
         raise SceneError(
             f"expected LLVM {OLDEST} or newer, got {dr.detail.llvm_version()[0]}, which was loaded "
             f"when mitsuba was imported; call sampling.find_llvm() before that, or set {VARIABLE}"
@@ -573,11 +575,11 @@ def load_mitsuba(variant: str = "auto") -> Any:
     if not usable[variant.split("_")[0]]:
         need = f"an LLVM; install {PACKAGE}, or set {VARIABLE}" if "llvm" in variant else "a GPU"
         raise SceneError(f"{variant} needs {need}")
-    # As on a machine, or in a container, of a single core.
+    # It is 1 on a machine, or in a container, with a single core.
     if dr.thread_count() < FEWEST_THREADS:
         dr.set_thread_count(FEWEST_THREADS)
     mi.set_variant(variant)
-    # Its warnings would break the live line; what matters is told here.
+    # Its warnings would break the live line; what matters is reported here.
     mi.set_log_level(mi.LogLevel.Error)
     _register_materials(variant)
     return mi
@@ -585,9 +587,9 @@ def load_mitsuba(variant: str = "auto") -> Any:
 
 @contextlib.contextmanager
 def preserved() -> Iterator[None]:
-    """Leave Mitsuba's variant and log level, and Dr.Jit's threads, as they were found.
+    """Restore Mitsuba's variant and log level, and Dr.Jit's threads, afterwards.
 
-    Where Mitsuba was not imported yet it has a variant afterwards, for it cannot be left without.
+    If Mitsuba was not imported before, it keeps a variant, because it cannot be left without one.
     """
     mi, dr = sys.modules.get("mitsuba"), sys.modules.get("drjit")
     found = None
@@ -608,7 +610,7 @@ def preserved() -> Iterator[None]:
 
 @functools.cache
 def _register_materials(variant: str) -> None:
-    """Make the materials of our own known, once to each variant."""
+    """Register the package's own materials, once with each variant."""
     mi = importlib.import_module("mitsuba")
     assert mi.variant() == variant
     hemisphere.register(mi, importlib.import_module("drjit"))
@@ -622,7 +624,7 @@ def _sampler_class(variant: str) -> Any:
 
     base: Any = mi.Sampler
 
-    class PixelSampler(base):  # type: ignore[misc]  # its base is known when Mitsuba is
+    class PixelSampler(base):  # type: ignore[misc]  # its base is known once Mitsuba is loaded
         """Random numbers of sample k of a pixel, whatever else is drawn along with it."""
 
         def __init__(self) -> None:
@@ -630,12 +632,12 @@ def _sampler_class(variant: str) -> Any:
             self.generator = mi.PCG32()
 
         def start(self, pixel: Any, number: Any, seed: Any) -> None:
-            """Begin with the first number of each sample."""
+            """Start at the first random number of each sample."""
             high, low = mi.sample_tea_32(pixel, seed)
             first, second = mi.sample_tea_32(high + number, low)
             state = mi.UInt64(first) << 32 | mi.UInt64(second)
             stream = mi.UInt64(high) << 32 | mi.UInt64(low)
-            # Not the constructor, which would add the lane's number to both.
+            # Not the constructor, which would add the lane's index to both.
             self.generator.seed(state, stream)
 
         def next_1d(self, active: Any = True) -> Any:
@@ -654,10 +656,10 @@ def _pixel_sampler(variant: str) -> Any:
 
 @contextlib.contextmanager
 def _files_of(mi: Any, path: Path) -> Iterator[Callable[[str], Path]]:
-    """Look for what a scene names where Mitsuba does; yield what finds the file of a name.
+    """Look for a scene's files where Mitsuba does; yield a function from a name to its file.
 
-    In the scene's folder, that of the file it is a link to, the working directory and Mitsuba's
-    own. What the scene adds to them by ``<path>`` is gone afterwards.
+    The folders are the scene's, that of the file it is a link to, the working directory and
+    Mitsuba's own. Those that the scene adds by ``<path>`` are dropped afterwards.
     """
     before = mi.file_resolver()
     resolver = mi.FileResolver(before)
@@ -673,7 +675,7 @@ def _files_of(mi: Any, path: Path) -> Iterator[Callable[[str], Path]]:
 def _is_file(path: Path) -> bool:
     try:
         return path.is_file()
-    except (OSError, ValueError):  # a string that is no name
+    except (OSError, ValueError):  # a string that cannot be a file name
         return False
 
 
@@ -690,9 +692,9 @@ def _nodes(mi: Any, state: Any, kind: str) -> list[Any]:
 
 
 def _integrator_names(mi: Any, state: Any) -> tuple[str, int | None]:
-    """Return what the scene says of its integrator: the plugin and its depth, None: no limit.
+    """Return the plugin of the scene's integrator and its depth, None: no limit.
 
-    Of nested ones (aov, moment) the innermost.
+    Of nested ones (aov, moment) it is the innermost.
     """
     found = _nodes(mi, state, "Integrator")
     if not found:
@@ -703,7 +705,7 @@ def _integrator_names(mi: Any, state: Any) -> tuple[str, int | None]:
 
 
 def _innermost(words: str) -> tuple[str, int | None]:
-    """Return the same of an integrator that is loaded, from what Mitsuba says of it."""
+    """Return the same of a loaded integrator, from Mitsuba's description of it."""
     names = re.findall(r"(\w+?)(?:Integrator)?\[", words)
     depths = [int(depth) for depth in re.findall(r"max_depth = (\d+)", words)]
     # Without a limit it is the largest number of 32 bits.

@@ -1,6 +1,6 @@
-"""What a scene of Mitsuba needs to be simulated, as far as it can be read from the scene.
+"""What must be simulated in a Mitsuba scene, as far as it can be read from the scene.
 
-It is handed Mitsuba's module: `sampling.renderers.mitsuba` alone imports it.
+Mitsuba's module is passed in: `sampling.renderers.mitsuba` alone imports it.
 """
 
 import re
@@ -16,31 +16,31 @@ KNOWN = {
     "VolpathMisIntegratorImpl": "volpathmis",
 }
 
-# The least roughness of a material that is no mirror: light that comes by way of a smoother one is
-# met too rarely. Status: choice.
+# Smallest roughness of a material that does not count as a mirror: light by way of a smoother one
+# is hit too rarely. Status: choice.
 ROUGH = 0.1
 
 
 class Needs(NamedTuple):
-    """What was read."""
+    """What was read from a scene."""
 
     integrator: str | None
-    """path, volpath or volpathmis; None: another one, one inside another, or one that hides
-    emitters, of which nothing is changed."""
+    """path, volpath or volpathmis; None: another one, a nested one, or one that hides emitters,
+    which is left unchanged."""
     max_depth: int | None
     """Most segments of a path; None: no limit."""
     rr_depth: int
-    """Where Russian roulette begins."""
+    """The depth at which Russian roulette begins."""
     media: bool
     """Whether any surface borders a medium, or the sensor is in one."""
     passes: bool
-    """Whether light passes through any surface without a bend (null, mask, thin glass)."""
+    """Whether light passes through any surface without bending (null, mask, thin glass)."""
     mirrors: bool
-    """Whether any surface is a mirror or clear, or nearly."""
+    """Whether any surface is a mirror or clear, or nearly so."""
     scatters: bool
     """Whether any surface scatters light."""
     broad_lights: bool
-    """Whether any light can be met by chance: it has an area, or is the environment."""
+    """Whether any light can be hit by chance: it has an area, or is the environment."""
     unread: bool
     """Whether there are instances, whose materials cannot be read."""
     tellable: bool
@@ -57,7 +57,7 @@ def read(mi: Any, scene: Any, sensor: Any, integrator: Any) -> Needs:
         name = None
     most = int(depth.group(1)) if depth is not None else 0
     shapes = scene.shapes()
-    # Once each, for many shapes share a material.
+    # Each once, because many shapes share a material.
     every = [shape.bsdf() for shape in shapes if shape.bsdf() is not None]
     bsdfs = list({bsdf.ptr: bsdf for bsdf in every}.values())
     flags = [int(bsdf.flags()) for bsdf in bsdfs]
@@ -93,7 +93,7 @@ def _rough(mi: Any, bsdf: Any, flags: int) -> bool:
     if not flags & int(mi.BSDFFlags.Glossy):
         return True
     values = dict(mi.traverse(bsdf))
-    # Of Disney's, whose roughness is another number, and of mixtures too little is known.
+    # Too little is known of Disney's, whose roughness is another quantity, and of mixtures.
     if any("roughness" in name or "bsdf_" in name for name in values):
         return False
     alphas = [
@@ -101,7 +101,7 @@ def _rough(mi: Any, bsdf: Any, flags: int) -> bool:
         for name, value in values.items()
         if re.search(r"(^|\.)alpha(_[uv])?(\.value)?$", name) is not None
     ]
-    # Single precision of Mitsuba's own 0.1.
+    # Mitsuba's own 0.1 is in single precision.
     return bool(alphas) and all(
         float(np.min(np.asarray(alpha))) >= ROUGH * (1.0 - 1e-6) for alpha in alphas
     )
@@ -109,7 +109,7 @@ def _rough(mi: Any, bsdf: Any, flags: int) -> bool:
 
 def _black(mi: Any, bsdf: Any) -> bool:
     """Return whether a material is known to reflect nothing."""
-    # Of spectral variants these are no reflectances.
+    # In spectral variants these values are not reflectances.
     if bsdf.class_name() != "SmoothDiffuse" or mi.is_spectral:
         return False
     value = dict(mi.traverse(bsdf)).get("reflectance.value")

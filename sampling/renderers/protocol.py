@@ -18,8 +18,8 @@ class Samples(NamedTuple):
 class Renderer(Protocol):
     """Draws samples of single pixels, independent of each other.
 
-    Sample k of a pixel is a function of the pixel, k and the seed alone: the same number in
-    whatever order, batch or round it is drawn.
+    Sample k of a pixel is a function of the pixel, k and the seed alone: it is the same in whatever
+    order, batch or round it is drawn.
     """
 
     @property

@@ -15,10 +15,10 @@ LAST_SHIFT = np.uint64(31)
 
 
 class Synthetic:
-    """Samples that are ``base``, and with a probability ``event / probability`` more.
+    """Samples of ``base``, and with ``probability`` ``event / probability`` more.
 
-    A small light that blind sampling hits with ``probability``: mean base + event, covariance
-    event event^T (1 - p) / p. The rarer, the longer nothing is seen of it.
+    It models a small light that blind sampling hits with ``probability``: mean base + event,
+    covariance event event^T (1 - p) / p. The rarer the event, the longer it goes unseen.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class Synthetic:
     probability
         (H, W), over 0 and at most 1.
     seed
-        Another seed, other samples.
+        Another seed gives other samples.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Synthetic:
     ) -> Samples:
         """Draw samples ``first[i]`` to ``first[i] + count[i] - 1`` of each of ``pixels``."""
         which = np.repeat(pixels, count)
-        # Each pixel has a stream of its own, and k is the place in it.
+        # Each pixel has a stream of its own, and k is the position in it.
         stream = np.repeat(_mixed(self._seed + pixels.astype(np.uint64) * GOLDEN), count)
         number = np.arange(len(which)) - np.repeat(np.cumsum(count) - count - first, count)
         bits = _mixed(stream + number.astype(np.uint64) * GOLDEN)

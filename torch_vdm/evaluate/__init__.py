@@ -1,1 +1,1 @@
-"""Many frames of several tests beside their reference: figures, comparisons, a report."""
+"""Many frames of several tests against their reference: figures, comparisons, a report."""

@@ -1,4 +1,4 @@
-"""Jobs worked through by a cluster of Dask."""
+"""Jobs run by a Dask cluster."""
 
 from collections.abc import Generator, Sequence
 from dataclasses import replace
@@ -17,21 +17,21 @@ def results(
 ) -> Generator[Result, None, None]:
     """Yield the results of jobs as they come, each once.
 
-    One of which every worker dies is told as skipped. A job that is done twice writes the same
+    A job whose workers all die is reported as skipped. A job that is done twice writes the same
     files again.
 
     Parameters
     ----------
     judge
-        What does a job.
+        Does a job.
     jobs
-        What to do; they are taken as there is room, and not held.
+        The jobs; they are taken as there is room, and not kept.
     known
-        Results of an earlier run, which stand where files and settings are the same.
+        Results of an earlier run, which are kept where files and settings are the same.
     scheduler, count
         See `torch_vdm.cluster.answers`, which also says what is raised.
     """
-    output = judge.output.absolute()  # whatever folder a worker is started in
+    output = judge.output.absolute()  # valid in whatever folder a worker is started
     sent = cluster.work(replace(judge, output=output), output / journal.NAME)
 
     def told(job: Job) -> tuple[Job, Result | None]:

@@ -41,12 +41,12 @@ COMPARED = {
     "flicker_max_jnd": "Flicker, maximum",
 }
 
-# Figures that the terminal has no room for; they are in the table that is written.
+# Figures for which the terminal has no room; they are in the table that is written.
 NOT_IN_TERMINAL = ("mean_luminance_change", "flicker_mean_jnd", "flicker_visible_fraction")
 
 
 class Outcome(NamedTuple):
-    """What is said at the end, and whether a maximum was over ``--fail-above``."""
+    """The text at the end, and whether a maximum was over ``--fail-above``."""
 
     text: str
     exceeded: bool
@@ -146,7 +146,7 @@ def _write(
     results: Iterable[Result],
     assumptions: Sequence[str],
 ) -> list[str]:
-    """Write tables and report; return what is said of the tests beside one another."""
+    """Write tables and report; return the sentences that compare the tests."""
     compared = overview.compare(COMPARED)
     sentences = [pair.sentence(COMPARED[pair.figure]) for pair in compared]
     output: Path = options.output
@@ -192,7 +192,7 @@ def _matched(options: argparse.Namespace) -> Matched:
 
 
 def _check_installed(options: argparse.Namespace) -> None:
-    """Refuse, before anything is computed, what would fail for a package or has no meaning."""
+    """Refuse, before anything is computed, what lacks a package or has no meaning."""
     if options.scheduler:
         cluster.check(options.scheduler, options.jobs)
     missing = peers.missing(options.peers)
@@ -205,7 +205,7 @@ def _check_installed(options: argparse.Namespace) -> None:
 
 
 def _prepare(options: argparse.Namespace) -> None:
-    """Make the output folder, where none with results is in the way."""
+    """Make the output folder, unless one with results is in the way."""
     output: Path = options.output
     if output.exists() and not output.is_dir():
         raise EvaluationError(f"{output}: expected a folder to write to, got a file")
@@ -223,7 +223,7 @@ def _prepare(options: argparse.Namespace) -> None:
 def _work_through(
     options: argparse.Namespace, bench: Bench, matched: Matched, lines: Journal
 ) -> None:
-    """Have the results of all frames in the journal, each as it comes."""
+    """Add the results of all frames to the journal, each as it comes."""
     judge = Judge(bench, options, options.output)
     with (
         closing(_coming(judge, matched.jobs, lines, options)) as coming,
@@ -276,7 +276,7 @@ def _check_any(overview: Overview) -> None:
 def _text(
     options: argparse.Namespace, overview: Overview, sentences: Sequence[str], exceeded: int
 ) -> str:
-    """Return what is said on the terminal at the end."""
+    """Return the text for the terminal at the end."""
     text = io.StringIO()
     console = plain_console(text, 100)
     console.print(_table(overview))
@@ -320,7 +320,7 @@ def _table(overview: Overview) -> Any:
 
 
 def shown(name: str, value: float) -> str:
-    """Return a figure with the digits that it is shown with."""
+    """Return a figure as text, with its number of digits."""
     figure = FIGURES[name]
     return f"{value:.{figure.digits}%}" if figure.percent else f"{value:.{figure.digits}f}"
 

@@ -9,9 +9,9 @@ class Figure(NamedTuple):
     Attributes
     ----------
     label
-        What it is called.
+        Its short name.
     digits
-        After the point.
+        Digits after the point.
     percent
         Whether it is a share.
     more_is_better

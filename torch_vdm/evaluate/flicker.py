@@ -7,11 +7,11 @@ from torch import Tensor
 def with_error_of_before(
     reference: Tensor, test: Tensor, reference_before: Tensor, test_before: Tensor
 ) -> Tensor:
-    """Return the test as it would be had its error stayed that of the frame before.
+    """Return the test as it would be with the error of the frame before.
 
-    The error is what the test has and the reference has not, in linear light. The metric between
-    the test and this image sees how the error changed, and nothing of how the scene moved: an error
-    that stays has none, nor has a test that equals its reference in both frames.
+    The error is test minus reference, in linear light. The metric between the test and this image
+    measures how the error changed, and not how the scene moved: it is 0 for an error that stays,
+    and for a test that equals its reference in both frames.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ def with_error_of_before(
     Returns
     -------
     Tensor
-        (3, H, W). Where the old error would take away more light than there is, 0, or the test's
+        (3, H, W). Where the old error would remove more light than there is, it is 0, or the test's
         own value where that is below 0.
     """
     expected = reference + (test_before - reference_before)

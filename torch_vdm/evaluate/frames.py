@@ -13,17 +13,17 @@ from typing import NamedTuple
 from torch_vdm.io.files import SUFFIXES as IMAGES
 from torch_vdm.io.refusal import printable
 
-# What is taken for an image in a folder; the content decides what it is. `.npy` is read in parts.
+# Suffixes of images in a folder; the content decides the format. `.npy` is read in parts.
 SUFFIXES = (*IMAGES, ".npy")
 
 # The columns of a manifest.
 COLUMNS = ("frame", "reference", "test", "path")
 
-# A part of a name that came from a manifest, in bytes: file systems take 255, and a suffix is to
-# be added. Status: choice.
+# Longest part of a name in a manifest, in bytes: file systems take 255, and a suffix is added.
+# Status: choice.
 LONGEST_PART = 240
 
-# As `glob` reads them: a bracket that nothing closes in its folder's name stands for itself.
+# Wildcards as `glob` reads them: a bracket that is not closed within its folder's name is literal.
 WILDCARDS = re.compile(r"\*\*/?|\*|\?|\[!?+\]?+[^\]/]*+\]")
 
 
@@ -49,7 +49,7 @@ class Job:
     before: tuple[Path, Path] | None = None
 
     def __str__(self) -> str:
-        """Return what it is called in messages."""
+        """Return its name in messages."""
         return f"{self.frame} of {self.test}"
 
 
@@ -63,7 +63,7 @@ class Missing:
 
 
 class Matched(NamedTuple):
-    """Tests in the order in which they were given, and what there is to do, frame by frame."""
+    """Tests in the order in which they were given, and the jobs, frame by frame."""
 
     tests: list[str]
     jobs: list[Job]
@@ -76,18 +76,18 @@ def match(reference: str, tests: Mapping[str, str], output: Path) -> Matched:
     Parameters
     ----------
     reference
-        A folder, in which every image counts, in folders below it too, and a frame is named by its
-        path in it without the suffix; or a pattern with ``*``, ``?``, ``[]`` or ``**``, and a frame
-        is named by what the wildcards stand for.
+        A folder, where every image counts, also in subfolders, and a frame is named by its path in
+        it without the suffix; or a pattern with ``*``, ``?``, ``[]`` or ``**``, and a frame is
+        named by what the wildcards match.
     tests
         The same for each test, by its name.
     output
-        A folder whose files are no frames.
+        A folder whose files are not frames.
 
     Raises
     ------
     EvaluationError
-        If a folder is missing or holds no image, or if a test's name is no name for a folder.
+        If a folder is missing or holds no image, or if a test's name cannot name a folder.
     """
     for test in tests:
         _check_name(test, "a test's name", parts=1)
@@ -149,7 +149,7 @@ def natural(name: str) -> list[tuple[int, str]]:
 
 
 def _why_not(frame: str, references: Sequence[Path], tests: Sequence[Path]) -> str:
-    """Say why a frame cannot be compared; nothing where it can."""
+    """Return why a frame cannot be compared; empty where it can."""
     for paths, what in ((references, "the reference"), (tests, "the test")):
         if not paths:
             return f"missing in {what}"
@@ -199,16 +199,16 @@ def _hidden(path: Path) -> bool:
 
 
 def _by_pattern(pattern: str) -> Iterator[tuple[str, Path]]:
-    """Yield what a pattern finds, named by what its wildcards stand for, but for the suffix."""
+    """Yield the files of a pattern, named by what its wildcards match, without the suffix."""
     pattern = Path(pattern).as_posix()
     without_suffix = re.sub(r"\.[^./]*$", "", pattern)
     expressions = [_expression(each) for each in (without_suffix, pattern)]
     for found in glob.glob(pattern, recursive=True):  # noqa: PTH207 - Path.glob needs a root
         path = Path(found)
-        if not path.name:  # the root of all
+        if not path.name:  # the root folder
             continue
         stem = path.with_suffix("").as_posix()
-        # A wildcard may stand for a part of the suffix too, as in '*exr'.
+        # A wildcard may match a part of the suffix too, as in '*exr'.
         for (expression, joints), name in (
             (expressions[0], stem),
             (expressions[1], stem),
@@ -221,7 +221,7 @@ def _by_pattern(pattern: str) -> Iterator[tuple[str, Path]]:
 
 
 def _expression(pattern: str) -> tuple[re.Pattern[str], list[str]]:
-    """Return a pattern with a group for each wildcard, and what joins each to those before."""
+    """Return an expression with a group for each wildcard, and what joins each to those before."""
     expression, joints, end = "", [], 0
     for wildcard in WILDCARDS.finditer(pattern):
         literal = pattern[end : wildcard.start()]
@@ -244,7 +244,7 @@ def _group(wildcard: str) -> str:
     if wildcard.startswith("**"):
         return "(.*/)?" if wildcard.endswith("/") else "(.*)"
     if wildcard.startswith("["):
-        # What `glob` makes of it, without what surrounds it: (?s:...) and the end of the text.
+        # The expression that `glob` uses, without what surrounds it: (?s:...) and the text's end.
         return f"({fnmatch.translate(wildcard)[4:-3]})"
     return "([^/]*)" if wildcard == "*" else "([^/])"
 
@@ -278,14 +278,14 @@ def _object(line: str, where: str) -> Mapping[str, object]:
 
 
 def _check_name(name: str, what: str, parts: int | None = None) -> None:
-    """Refuse a name that would be written outside the output folder, or nowhere."""
+    """Refuse a name that would be written outside the output folder, or cannot be written."""
     if not _fits(name) or (parts is not None and name.count("/") >= parts):
         kind = "a word" if parts == 1 else "a relative path without '..'"
         raise EvaluationError(f"{what}: expected {kind} to write a file under, got {name[:80]!r}")
 
 
 def _fits(name: str) -> bool:
-    """Say whether a file may be written under a name, below a folder, on every system."""
+    """Return whether a file may be written under a name, below a folder, on every system."""
     parts = name.split("/")
     return (
         all(part not in ("", ".", "..") for part in parts)

@@ -1,4 +1,4 @@
-"""Results as they come: a line for each frame and test, safe from a kill at any moment."""
+"""Results as they come: a line for each frame and test, safe if killed at any moment."""
 
 import json
 import os
@@ -15,17 +15,17 @@ from torch_vdm.io import ImageError
 
 NAME, LOCK = "journal.jsonl", "journal.lock"
 
-# What a line has beside a result: CRC-32 of the rest as JSON. A disk may change a digit, and the
-# line would still be read.
+# A line's field besides those of a result: CRC-32 of the rest as JSON. A disk may change a digit,
+# and the line would still be read.
 CHECK = "check"
 
-# Bytes that are looked through at once for the end of the last whole line. Status: choice.
+# Bytes that are searched at once for the end of the last whole line. Status: choice.
 BLOCK = 2**16
 
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What is known of one frame of one test; a line of the journal.
+    """The result of one frame of one test; a line of the journal.
 
     Attributes
     ----------
@@ -48,11 +48,11 @@ class Result:
     pictures
         Names of the pictures that the page shows: reference, test and map.
     block
-        A pixel of these pictures stands for so many pixels on each side.
+        A pixel of these pictures stands for a square of so many pixels a side.
     notes
         What was assumed and repaired.
     seconds
-        The metric's own time, and the whole, reading and writing too.
+        The metric's own time, and the total, including reading and writing.
     """
 
     frame: str
@@ -79,9 +79,9 @@ class Result:
 class Journal(Mapping[tuple[str, str], Result]):
     """The journal of an output folder; use it in a ``with`` statement.
 
-    It has the last result of each frame and test, and takes more. A torn last line, and one that
-    was damaged or that another version wrote, count for nothing. Of a result only its place in the
-    file is held in memory. While one is open no other can be: two would each have only their own.
+    It has the last result of each frame and test, and takes more. A torn last line is ignored, and
+    so are lines that are damaged or of another version. Only a result's place in the file is kept
+    in memory. While one is open no other can be: two would each have only their own results.
 
     Raises
     ------
@@ -92,7 +92,7 @@ class Journal(Mapping[tuple[str, str], Result]):
     def __init__(self, folder: Path) -> None:
         self._path = folder / NAME
         self._places: dict[tuple[str, str], int] = {}
-        # The system frees it however the process ends.
+        # The system releases it however the process ends.
         self._lock = FileLock(folder / LOCK)
         try:
             self._lock.acquire(blocking=False)
@@ -152,13 +152,13 @@ class Journal(Mapping[tuple[str, str], Result]):
         while rest:
             rest = rest[os.write(self._file, rest) :]
         os.fsync(self._file)
-        # Where the end is now: nobody else writes, but if somebody did he would only have added.
+        # The current end: nobody else writes, but if somebody did, they would only have appended.
         end = os.lseek(self._file, 0, os.SEEK_CUR)
         self._places[result.frame, result.test] = end - len(line)
 
 
 class Selection:
-    """Results of a journal by their frames and tests, read each time they are gone through."""
+    """Results of a journal by their frames and tests, read at each iteration."""
 
     def __init__(
         self, journal: Mapping[tuple[str, str], Result], keys: Sequence[tuple[str, str]]
@@ -166,12 +166,12 @@ class Selection:
         self._journal, self._keys = journal, keys
 
     def __iter__(self) -> Iterator[Result]:
-        """Read one after another."""
+        """Read them one after another."""
         return (self._journal[key] for key in self._keys)
 
 
 def _parsed(line: bytes) -> Result | None:
-    """Return the result of a line; None of one that counts for nothing."""
+    """Return the result of a line; None for a line that is ignored."""
     try:
         fields: Any = json.loads(line)
         check = fields.pop(CHECK)

@@ -27,7 +27,7 @@ from torch_vdm.vdm import VDM
 # Where maps, and pictures for the page, lie in the output folder.
 MAPS, PICTURES = "maps", "pictures"
 
-# Options that change no figure: where things lie, and how they are worked through.
+# Options that change no figure: where files lie, and how the work is done.
 NOT_SETTINGS = (
     "command", "reference", "test", "manifest", "output", "jobs", "resume", "fail_above", "junit",
     "parquet", "scheduler", "tile",
@@ -35,13 +35,14 @@ NOT_SETTINGS = (
 
 
 class Bench(NamedTuple):
-    """What a command line knows: how two files are read, and by which metric they are judged.
+    """How a command line reads two files, and by which metric it judges them.
 
     Attributes
     ----------
     load
-        Returns the pairs that two files hold, of which a pixel has the largest difference, and what
-        was assumed; raises a ValueError of one line for files that cannot be compared.
+        Returns the pairs that two files hold, and what was assumed; a pixel has the largest
+        difference over the pairs. Raises a ValueError of one line for files that cannot be
+        compared.
     metric
         Returns the metric for a display.
     largest_whole
@@ -53,12 +54,12 @@ class Bench(NamedTuple):
     largest_whole: int
 
 
-class CannotJudge(Exception):  # noqa: N818 - it says why, and no program failed
+class CannotJudge(Exception):  # noqa: N818 - it gives a reason, the program did not fail
     """A frame that cannot be compared, and why."""
 
 
 class _Judged(NamedTuple):
-    """A map (H, W), the light of the two images (3, H, W), and what was found out."""
+    """A map (H, W), the light of the two images (3, H, W), and what was computed."""
 
     jnd: Tensor
     reference: Tensor
@@ -110,7 +111,7 @@ class Judge:
         return replace(result, key=key, seconds=seconds)
 
     def key(self, job: Job) -> str:
-        """Return the hash of all that the result depends on."""
+        """Return the hash of everything that the result depends on."""
         contents = [_content(job.reference), _content(job.path)]
         if self.options.flicker and job.before:
             contents += [_content(path) if path.is_file() else "" for path in job.before]
@@ -124,7 +125,7 @@ class Judge:
                 return self._compared(job)
         except MemoryError as error:
             raise CannotJudge(f"{job.path}: not enough memory to compare it") from error
-        # Whatever a file makes a reader or the metric raise, the other frames are not to blame.
+        # Whatever a file makes a reader or the metric raise, the other frames are still compared.
         except Exception as error:
             text = " ".join(str(error).split())
             why = text if isinstance(error, ValueError) else f"{type(error).__name__}: {text}"
@@ -138,7 +139,7 @@ class Judge:
         seconds = time.perf_counter() - start
         jnd = torch.stack(found).amax(0) if len(found) > 1 else found[0]
         maxima = [each.max().item() for each in found]
-        most = maxima.index(max(maxima))  # the pair that shows most
+        most = maxima.index(max(maxima))  # the pair with the largest difference
         pair = pairs[most]
         light = _light(pair.reference, pair.display), _light(pair.test, pair.display)
         told = figures(jnd)
@@ -179,9 +180,9 @@ class Judge:
         light: tuple[Tensor, Tensor],
         notes: list[str],
     ) -> dict[str, float | None]:
-        """Return the figures of flicker of the pair of a number among a frame's pairs.
+        """Return the figures of flicker of one of a frame's pairs, given by its number.
 
-        A frame before that cannot be read, or is of another kind, is told of.
+        A frame before that cannot be read, or is of another kind, is noted.
         """
         assert job.before is not None
         try:
@@ -205,7 +206,7 @@ class Judge:
         }
 
     def _written(self, job: Job, judged: _Judged) -> Result:
-        """Write the map and the pictures, and return what is known."""
+        """Write the map and the pictures, and return the result."""
         height, width = judged.jnd.shape
         raw, small = map_paths(self.output, job.frame, job.test)
         folder = self.output / PICTURES
@@ -233,7 +234,7 @@ class Judge:
         )
 
     def _is_whole(self, known: Result) -> bool:
-        """Say whether everything that was written with a result is still there."""
+        """Return whether everything that was written with a result is still there."""
         folder = self.output / PICTURES
         files = [pictures.path_of(folder, name) for name in known.pictures.values()]
         files += map_paths(self.output, known.frame, known.test)
@@ -241,7 +242,7 @@ class Judge:
 
 
 def map_paths(output: Path, frame: str, test: str) -> tuple[Path, Path]:
-    """Return where the map of a frame lies, and the small picture of it."""
+    """Return the paths of a frame's map and of its thumbnail."""
     folder = output / MAPS / test
     # Not with_suffix: a frame's name may have dots.
     return folder / f"{frame}.exr", folder / f"{frame}.png"
@@ -257,7 +258,7 @@ def settings(options: argparse.Namespace) -> dict[str, object]:
 
 
 def _plain(value: object) -> object:
-    """Return an option's value as JSON and a reader can have it."""
+    """Return an option's value in a form for JSON and for readers."""
     if isinstance(value, list):
         return ",".join(value)
     return value if isinstance(value, bool | int | float | str | None) else str(value)
@@ -275,20 +276,20 @@ def _content(path: Path) -> str:
 
 
 def _light(source: Source, display: Display) -> Tensor:
-    """Return linear light (3, H, W), 1.0 is white, as the display shows it."""
+    """Return linear light (3, H, W), where 1.0 is white, as the display shows it."""
     pixels = whole(source)[0].float()
     linear = decode_srgb(pixels) if display.encoding == "srgb" else pixels
     return linear.mul(2.0**display.exposure)
 
 
 def _pixels(light: Tensor, display: Display) -> Tensor:
-    """Return the pixel values of light: what `_light` takes."""
+    """Return the pixel values of light: the inverse of `_light`."""
     linear = light * 2.0**-display.exposure
     return encode_srgb(linear) if display.encoding == "srgb" else linear
 
 
 def _luminance_change(reference: Tensor, test: Tensor) -> float | None:
-    """Return how much brighter the test is, relative; None beside a black reference."""
+    """Return how much brighter the test is, relative; None against a black reference."""
     weights = torch.tensor(BT709_TO_XYZ[1], dtype=torch.float64)
     one, other = (
         (image.mean((1, 2), dtype=torch.float64) * weights).sum().item()

@@ -1,4 +1,4 @@
-"""What the page tells of a map: how many pixels show how much, and where the worst places are."""
+"""What the page shows of a map: a histogram of its pixels, and where the worst places are."""
 
 import torch
 from torch import Tensor
@@ -6,11 +6,11 @@ from torch.nn import functional
 
 from torch_vdm.report import BAND
 
-# Borders between the bars of a histogram, in JND: three an octave from 1/16 to 128, and 1 JND among
+# Borders between the bars of a histogram, in JND: three per octave from 1/16 to 128, 1 JND among
 # them. Status: choice.
 BORDERS = tuple(2.0 ** (step / 3.0) for step in range(-12, 22))
 
-# How many regions are told of, and the side of one, in degrees of vision and at least in pixels:
+# How many regions are reported, and the side of one, in degrees of vision and at least in pixels:
 # what the eye sees sharply at once. Status: choice.
 REGIONS, REGION_DEGREES, SMALLEST_REGION = 8, 1.0, 16
 
@@ -20,7 +20,7 @@ Region = tuple[int, int, int, int, float]
 def counts(jnd: Tensor) -> list[int]:
     """Return how many pixels of a map (H, W) lie between the borders, below and above them.
 
-    A value on a border belongs to what is below it: what is over 1 JND is visible.
+    A value on a border belongs below it: what is over 1 JND is visible.
     """
     borders = torch.tensor(BORDERS, dtype=jnd.dtype)
     found = torch.zeros(len(BORDERS) + 1, dtype=torch.int64)

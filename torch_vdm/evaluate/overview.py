@@ -1,4 +1,4 @@
-"""What is said of all frames together, from one look at each result."""
+"""A summary of all frames, from one pass over the results."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ from torch_vdm.evaluate.figures import FIGURES
 from torch_vdm.evaluate.journal import Result
 from torch_vdm.evaluate.statistics import Floats, Paired
 
-# Skipped frames of which the reasons are said at once. Status: choice.
+# Skipped frames whose reasons are printed. Status: choice.
 NAMED = 5
 
 
@@ -24,13 +24,13 @@ class Overview:
     tests
         Their names.
     values
-        By figure, as far as any frame has it: (frames, tests), NaN where there is none.
+        By figure that any frame has: (frames, tests), NaN where there is none.
     compared, skipped
         How many frames of each test (tests,).
     seconds
-        What each test took (tests,), reading and writing too.
+        The time of each test (tests,), including reading and writing.
     first_skipped
-        The first few of those that are skipped.
+        The first few skipped results.
     worst
         The result with the largest maximum, if there is any.
     """
@@ -45,7 +45,7 @@ class Overview:
 
     @classmethod
     def of(cls, tests: Sequence[str], frames: int, results: Iterable[Result]) -> "Overview":
-        """Return it of results that come frame by frame, of so many frames."""
+        """Return the overview of results that come frame by frame, for so many frames."""
         none = [0] * len(tests)
         made = cls(tests, {}, [*none], [*none], [0.0 for _ in tests])
         row, name = -1, None
@@ -79,13 +79,13 @@ class Overview:
         return values[~np.isnan(values)]
 
     def exceeded(self, fail_above: float | None) -> list[int]:
-        """Return on how many frames of each test the maximum is larger."""
+        """Return on how many frames of each test the maximum is above ``fail_above``."""
         if fail_above is None or "max_jnd" not in self.values:
             return [0] * len(self.tests)
         return [int(count) for count in (self.values["max_jnd"] > fail_above).sum(0)]
 
     def compare(self, names: Iterable[str]) -> list[Paired]:
-        """Compare every two tests by every one of these figures that both have."""
+        """Compare every pair of tests by each of these figures that both have."""
         found = []
         for one, other in combinations(range(len(self.tests)), 2):
             for name in names:

@@ -16,8 +16,8 @@ from torch_vdm.evaluate.overview import Overview
 from torch_vdm.io import atomic_path
 from torch_vdm.report import SMALLEST_SCALE
 
-# The page's own scripts, in the order in which they build on one another. Plots, zoom and the rows
-# of tables are D3's, which lies beside them.
+# The page's own scripts, in the order in which they build on one another. D3, which lies next to
+# them, draws plots, zoom and the rows of tables.
 SCRIPTS = ("data.js", "summary.js", "pictures.js", "frame.js", "controls.js")
 
 
@@ -34,13 +34,13 @@ def write(
     Parameters
     ----------
     path
-        The page; maps and pictures lie in folders beside it.
+        The page; maps and pictures lie in folders next to it.
     overview, results
         All results, frame by frame.
     sentences
-        What is said of the tests beside one another.
+        The sentences that compare the tests.
     settings
-        By name.
+        Settings by name.
     assumptions
         What was assumed for all frames, one sentence each.
     """
@@ -97,7 +97,7 @@ def _listed(values: Iterable[object]) -> Iterator[str]:
 
 
 def _row(result: Result, tests: Sequence[str], names: Sequence[str]) -> list[object]:
-    """Return what the page knows of a frame of a test, in the order in which its script reads."""
+    """Return the page's data of a frame of a test, in the order in which its script reads them."""
     return [
         result.frame,
         tests.index(result.test),

@@ -1,4 +1,4 @@
-"""What other metrics say of the same frame, so that readers see where they disagree."""
+"""Other metrics of the same frame, so that readers see where they disagree."""
 
 import importlib.util
 import math
@@ -12,8 +12,8 @@ from torch_vdm.model.display import encode_srgb
 # The side of SSIM's window, in pixels. Source: Wang et al. 2004. Status: source.
 SSIM_WINDOW = 11
 
-# Strips of an image that are filtered side by side: one channel alone takes the convolution five
-# times as long. Status: choice.
+# Strips of an image that are filtered as channels: with one channel alone the convolution takes
+# five times as long. Status: choice.
 SSIM_STRIPS = 4
 
 # Luma of BT.709. Source: ITU-R BT.709-6. Status: source.
@@ -22,7 +22,7 @@ LUMA = (0.2126, 0.7152, 0.0722)
 # Packages of the peers that are asked for by name.
 PACKAGES = {"flip": "flip_evaluator", "cvvdp": "pycvvdp"}
 
-# What is installed to have them.
+# How to install them.
 EXTRA = "pip install 'torch-vdm[peers]'"
 
 
@@ -34,14 +34,14 @@ def missing(names: list[str]) -> list[str]:
 def judged(
     names: Sequence[str], test: Tensor, reference: Tensor, ppd: float, white: float
 ) -> tuple[dict[str, float | None], list[str]]:
-    """Return what peers say of two images of light (3, H, W), where 1.0 is white.
+    """Return the peers' figures for two images of light (3, H, W), where 1.0 is white.
 
     Parameters
     ----------
     names
-        Of the images as sRGB shows them, clipped to [0, 1]: "psnr" in dB, None where they are
-        equal; "ssim", the mean over the luma where its window is within; "flip", the mean error, 0
-        to 1, less is better. Of the light: "cvvdp", quality in JOD, 10 is best.
+        On the images in sRGB code, clipped to [0, 1]: "psnr" in dB, None where they are equal;
+        "ssim", the mean over the luma where its window fits; "flip", the mean error, 0 to 1, less
+        is better. On the light: "cvvdp", quality in JOD, 10 is best.
     test, reference
         The images.
     ppd
@@ -51,7 +51,7 @@ def judged(
 
     Returns
     -------
-    The figures, None for one that fails, as on very small images; and a sentence for each of these.
+    The figures, None for one that fails, as on very small images; and a sentence for each failure.
     """
     one, other = (encode_srgb(image).clamp(0.0, 1.0) for image in (test, reference))
     peers: dict[str, Callable[[], float | None]] = {
@@ -65,7 +65,7 @@ def judged(
     for name in names:
         try:
             values[name] = peers[name]()
-        except Exception as error:  # whatever another's code raises
+        except Exception as error:  # whatever foreign code raises
             values[name] = None
             notes.append(f"no {name}: {' '.join(str(error).split())}")
     return values, notes
@@ -91,7 +91,7 @@ def _ssim(test: Tensor, reference: Tensor) -> float:
         luma = torch.tensordot(torch.tensor(LUMA), image, 1)
         strips.append(torch.stack([luma[top : top + rows + SSIM_WINDOW - 1] for top in tops]))
     similarity: Tensor = ssim(strips[0][None], strips[1][None], SSIM_WINDOW, padding="valid")[0]
-    # A strip that begins above its place repeats rows of those before.
+    # A strip that begins above its place repeats rows of the strip before.
     new = [strip[number * rows - tops[number] :] for number, strip in enumerate(similarity)]
     total: float = sum(strip.double().sum().item() for strip in new)
     return total / (height * width)
@@ -109,7 +109,7 @@ def _flip(test: Tensor, reference: Tensor, ppd: float) -> float:
 def _cvvdp(test: Tensor, reference: Tensor, ppd: float, white: float) -> float:
     import pycvvdp
 
-    # A screen that shows all light as it is, without reflections: the file's own.
+    # A screen that shows the light of the file as it is, without reflections.
     screen = pycvvdp.vvdp_display_photo_eotf(
         1e5, contrast=1e9, source_colorspace="BT.709-linear", EOTF="linear", k_refl=0.0
     )

@@ -1,8 +1,9 @@
-"""Pictures beside the page, which keep values: the page reads numbers, not colours.
+"""Pictures next to the page, which keep values: the page reads numbers, not colours.
 
 A browser hides the pixels of a picture file from a page that was opened from a disk, and may change
-their colours. So each picture is a script that calls ``picture(name, width, height, kind, data)``:
-base64 of deflated planes of bytes, each byte the difference to the one at its left, modulo 256.
+their colours. So each picture is a script that calls ``picture(name, width, height, kind, data)``;
+data is base64 of deflated planes of bytes, each byte the difference from its left neighbour, modulo
+256.
 
 =======  ======================================================================
 kind     planes of (height, width)
@@ -28,27 +29,27 @@ from torch_vdm.io import atomic_path
 from torch_vdm.model.display import encode_srgb
 from torch_vdm.report import SMALLEST_SCALE
 
-# A side of a picture that the page shows, in pixels; larger images are shown by blocks of pixels.
+# Largest side of a picture on the page, in pixels; larger images are shown in blocks of pixels.
 # A browser's canvas takes more, but not much. Status: choice.
 LARGEST_SIDE = 4096
 
-# Sides of the small pictures of maps, in pixels. Status: choice.
+# Largest side of the thumbnails of maps, in pixels. Status: choice.
 THUMBNAIL = 320
 
-# Hundredths of a JND: what the page prints. Status: choice.
+# Steps per JND: the page prints hundredths. Status: choice.
 STEPS = 100
 
-# Of a picture of light; what is darker is black. With it 2^(8 - e) is a float. Status: derived.
+# Of a picture of light; darker light is black. With it 2^(8 - e) is a float. Status: derived.
 SMALLEST_EXPONENT = -119
 
-# How well pictures are packed, 0 to 3: more finds little in noise. Status: choice.
+# Compression level of pictures, 0 to 3: a higher one gains little on noise. Status: choice.
 LEVEL = 1
 
 Bytes = NDArray[np.uint8]
 
 
 def block(size: tuple[int, int]) -> int:
-    """Return the side of the blocks of pixels by which an image (height, width) is shown."""
+    """Return the side of the blocks of pixels in which an image (height, width) is shown."""
     return -(-max(size) // LARGEST_SIDE)
 
 
@@ -58,11 +59,11 @@ def write_image(folder: Path, light: Tensor, coded: bool) -> str:
     Parameters
     ----------
     folder
-        Where to.
+        The folder to write to.
     light
         (3, H, W), linear, 1.0 is white; light below 0 is shown as 0.
     coded
-        Whether 8 bits of sRGB hold it: it came from such a file.
+        Whether 8-bit sRGB codes hold it, because it came from such a file.
     """
     step = block((light.shape[-2], light.shape[-1]))
     if step > 1:
@@ -113,8 +114,8 @@ def _with_common_exponent(light: NDArray[np.float32]) -> Bytes:
     """Return bytes of R, G, B and their exponent (4, H, W): Radiance's RGBE, value for value."""
     light = np.maximum(light, np.float32(0.0))
     largest = light.max(0)
-    # As `numpy.frexp` and `ldexp` would, which take several times as long: the exponent of a float
-    # is in its bits, and a power of two is made of it.
+    # The same as `numpy.frexp` and `ldexp`, which take several times as long: the exponent of a
+    # float is in its bits, and a power of two is built from it.
     exponent = (largest.view(np.int32) >> 23) - 126
     exponent = np.clip(np.where(largest == 0.0, 0, exponent), SMALLEST_EXPONENT, 127)
     power = ((8 - exponent + 127) << 23).astype(np.int32).view(np.float32)
@@ -127,7 +128,7 @@ def _with_common_exponent(light: NDArray[np.float32]) -> Bytes:
 
 
 def _write(folder: Path, kind: str, planes: Bytes) -> str:
-    """Write planes under a name that follows from their content: once, however often asked."""
+    """Write planes under a name derived from their content, once however often it is called."""
     name = hashlib.sha256(repr((kind, planes.shape)).encode() + planes.tobytes()).hexdigest()[:24]
     path = path_of(folder, name)
     if not path.exists():

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 Floats: TypeAlias = NDArray[np.float64]
 
-# How many times the frames are drawn again, and the share of the medians within the interval.
+# How many times the frames are resampled, and the share of the medians within the interval.
 # Status: choice.
 DRAWINGS, CONFIDENCE = 4000, 0.95
 
-# With fewer frames nothing can be told: five that all agree do so by chance one time in sixteen,
-# 2 * 0.5^5 > 1 - CONFIDENCE. Status: derived.
+# With fewer frames nothing can be concluded: five that all agree do so by chance one time in
+# sixteen, 2 * 0.5^5 > 1 - CONFIDENCE. Status: derived.
 FEWEST = 6
 
 # Numbers that are drawn at once, so that memory is bounded. Status: choice.
@@ -23,14 +23,14 @@ AT_ONCE = 2**22
 
 @dataclass(frozen=True)
 class Paired:
-    """Test ``other`` beside test ``one``, by one figure over the frames that both have.
+    """Test ``other`` against test ``one``, by one figure over the frames that both have.
 
     Attributes
     ----------
     one, other
         Names of the tests.
     figure
-        The figure that is compared, of which less is better.
+        The figure that is compared; less is better.
     frames
         Number of frames.
     median
@@ -51,7 +51,7 @@ class Paired:
     higher: int
 
     def sentence(self, what: str) -> str:
-        """Say it in words, which begin with ``what`` the figure is; the figure is in JND."""
+        """Return it as a sentence that begins with ``what``; the figure is in JND."""
         low, high = self.interval
         if self.frames < FEWEST:
             return (
@@ -85,7 +85,7 @@ def compare(one: str, other: str, figure: str, pairs: Floats, seed: int = 0) -> 
     pairs
         The figure of ``one`` and of ``other`` (frames, 2), of one frame at least.
     seed
-        Of the bootstrap: the same values give the same interval.
+        Seed of the bootstrap: the same values give the same interval.
     """
     differences: Floats = pairs[:, 1] - pairs[:, 0]
     return Paired(
@@ -101,7 +101,7 @@ def compare(one: str, other: str, figure: str, pairs: Floats, seed: int = 0) -> 
 
 
 def interval(differences: Floats, seed: int = 0) -> tuple[float, float]:
-    """Return the bootstrap interval of the median, of percentiles."""
+    """Return the percentile bootstrap interval of the median."""
     rng = np.random.default_rng(seed)
     count = len(differences)
     rows = max(1, AT_ONCE // count)

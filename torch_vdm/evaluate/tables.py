@@ -14,7 +14,7 @@ from torch_vdm.evaluate.journal import Result
 from torch_vdm.evaluate.overview import Overview
 from torch_vdm.io import atomic_path
 
-# Columns that hold text and whole numbers, and the lines of a table that are packed at once.
+# Columns that hold text and whole numbers, and the lines of a table that are written at once.
 TEXT, WHOLE = {"frame", "test", "skipped"}, {"width", "height", "max_x", "max_y"}
 AT_ONCE = 4096
 
@@ -25,7 +25,7 @@ def columns(names: Iterable[str]) -> list[str]:
 
 
 def row(result: Result, names: Iterable[str]) -> list[object]:
-    """Return what stands in the columns; None for what has no value."""
+    """Return the values of the columns; None for a missing one."""
     figures = [result.figures.get(name) for name in names]
     rest: tuple[object, ...] = (None,) * 5
     if not result.skipped:
@@ -34,7 +34,7 @@ def row(result: Result, names: Iterable[str]) -> list[object]:
 
 
 def write_csv(path: Path, names: Sequence[str], results: Iterable[Result]) -> None:
-    """Write a line for each frame and test; what has no value is empty."""
+    """Write a line for each frame and test; a missing value is empty."""
     with (
         atomic_path(path) as temporary,
         temporary.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file,
@@ -62,7 +62,7 @@ def write_parquet(path: Path, names: Sequence[str], results: Iterable[Result]) -
 
 
 def write_json(path: Path, told: Mapping[str, object], results: Iterable[Result]) -> None:
-    """Write what is told of all, and under ``frames`` all results, a line for each."""
+    """Write the entries of ``told``, and under ``frames`` all results, a line for each."""
     head, end = json.dumps({**told, "frames": []}, indent=1, allow_nan=False).rsplit("]", 1)
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(head)
@@ -106,7 +106,7 @@ def write_junit(
 
 
 def exceeds(result: Result, fail_above: float | None) -> bool:
-    """Say whether the maximum of a frame is over what was asked for."""
+    """Return whether the maximum of a frame is over ``fail_above``."""
     largest = result.figures.get("max_jnd")
     return fail_above is not None and largest is not None and largest > fail_above
 

@@ -1,4 +1,4 @@
-"""Jobs worked through by several processes, any of which may die."""
+"""Jobs run by several processes, any of which may die."""
 
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import suppress
@@ -19,7 +19,7 @@ Known = Mapping[tuple[str, str], Result]
 
 
 class _Hand(NamedTuple):
-    """A process, and what it was given to do."""
+    """A process, and the job it was given."""
 
     process: SpawnProcess
     job: Job
@@ -33,14 +33,14 @@ def results(
     Parameters
     ----------
     judge
-        What does a job; it is sent to each process.
+        Does a job; it is sent to each process.
     jobs
-        What to do.
+        The jobs.
     known
-        Results of an earlier run, which stand where files and settings are the same.
+        Results of an earlier run, which are kept where files and settings are the same.
     count
-        Number of processes; 1 works in this one. They share its threads. One that dies has its job
-        told as skipped, and another takes its place.
+        Number of processes; 1 works in this one. They share its threads. If one dies, its job is
+        reported as skipped, and another takes its place.
 
     Raises
     ------
@@ -99,13 +99,13 @@ def _start(
 
 
 def _give(connection: Connection, job: Job, known: Known) -> None:
-    # That the process died is seen where its answer is awaited.
+    # A process that died is noticed where its answer is awaited.
     with suppress(BrokenPipeError, ConnectionResetError):
         connection.send((job, known.get((job.frame, job.test))))
 
 
 def _end(connection: Connection, hand: _Hand) -> None:
-    """End a process, whose work is done, and forget it: by itself it would take half a second."""
+    """End a process whose work is done, and close it: by itself it would take half a second."""
     connection.close()
     hand.process.terminate()
     hand.process.join()
@@ -124,7 +124,7 @@ def _died(connection: Connection, hand: _Hand) -> Result:
 
 
 def _work(connection: Connection, judge: Judge, threads: int) -> None:
-    """Do jobs until there are no more, or nobody is there to take the results."""
+    """Do jobs until there are no more, or nobody takes the results."""
     torch.set_num_threads(threads)
     while True:
         try:
@@ -134,7 +134,7 @@ def _work(connection: Connection, judge: Judge, threads: int) -> None:
         answer: Result | Exception
         try:
             answer = judge(job, known)
-        except Exception as error:  # the other process tells of it
+        except Exception as error:  # the other process raises it
             answer = error
         try:
             connection.send(answer)

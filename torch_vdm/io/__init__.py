@@ -1,4 +1,4 @@
-"""Images from files and to files; docs/files.md says which."""
+"""Images read from files and written to files; docs/files.md lists the formats."""
 
 from torch_vdm.io.arrays import ArrayFile
 from torch_vdm.io.files import (

@@ -34,7 +34,7 @@ def colour(background: str) -> tuple[float, float, float]:
 
 
 def plane(values: Floats, notes: list[str]) -> Floats:
-    """Return an alpha plane held to [0, 1]; NaN, which some renderers write, is opaque."""
+    """Return an alpha plane clamped to [0, 1]; NaN, which some renderers write, is opaque."""
     unknown = np.isnan(values)
     if unknown.any():
         notes.append(f"{int(unknown.sum())} values of alpha are NaN, and taken as opaque.")
@@ -45,8 +45,8 @@ def plane(values: Floats, notes: list[str]) -> Floats:
 def over(image: Decoded, background: str, notes: list[str]) -> Floats:
     """Return the pixels (3, H, W) of an image over a background.
 
-    In the values that the image has: sRGB-coded ones as browsers do it, light as renderers do it.
-    Straight colours are multiplied by alpha, associated ones are already.
+    They are composited in the image's own values: sRGB codes as browsers do it, light as renderers
+    do it. Straight colours are multiplied by alpha, associated ones already are.
     """
     if image.alpha is None or (image.alpha == 1).all():
         return image.pixels
@@ -62,7 +62,7 @@ def over(image: Decoded, background: str, notes: list[str]) -> Floats:
 
 
 def straight(pixels: Floats, alpha: Floats) -> Floats:
-    """Return associated colours divided by alpha; where it is 0 they are kept."""
+    """Return associated colours divided by alpha; where alpha is 0 they are kept."""
     divisor: Floats = np.where(alpha > 0, alpha, np.float32(1))
     return pixels / divisor
 

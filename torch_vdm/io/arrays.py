@@ -1,4 +1,4 @@
-"""NumPy's .npy files, read part by part: how an image larger than memory lies on a disk."""
+"""NumPy's .npy files, read part by part: for images larger than memory."""
 
 import os
 from pathlib import Path
@@ -11,14 +11,14 @@ from torch_vdm.io.refusal import ImageError, Negative, Nonfinite, require_finite
 
 MAGIC = b"\x93NUMPY"
 
-# What is taken: whole numbers from 0 to white, and light or, if asked for, code.
+# The types read: whole numbers from 0 to white, and floats of light or, if asked for, of code.
 WHOLE, FLOATS = ("uint8", "uint16"), ("float16", "float32", "float64")
 
 
 class ArrayFile:
-    """An image in a .npy file, (3, H, W) or (H, W, 3); indexed, it gives parts of (3, H, W).
+    """An image in a .npy file, (3, H, W) or (H, W, 3); indexing returns parts of (3, H, W).
 
-    The file is mapped anew for each part, so that what was read leaves memory with it.
+    The file is mapped anew for each part, so that the pages read leave memory with it.
 
     Parameters
     ----------
@@ -56,13 +56,13 @@ class ArrayFile:
             self._refuse(f"expected a shape (3, H, W) or (H, W, 3), got {array.shape}")
 
     def __getitem__(self, index: Any, /) -> NDArray[Any]:
-        """Return a part, of slices for channels, rows and columns, as an array in memory."""
+        """Return the part at slices of channels, rows and columns, as an array in memory."""
         stored = self._array()
         native = stored.dtype.newbyteorder("=")
         if not self.floating:
             whole: NDArray[Any] = stored[index].astype(native)
             return whole
-        # With their neighbours, where NaN is to take the mean of these.
+        # With neighbours around the part, where NaN is to become their mean.
         margin = 1 if self.nonfinite == "clamp" else 0
         begins = [max(0, (side.start or 0) - margin) for side in index[1:]]
         wide = [
@@ -102,7 +102,7 @@ class ArrayFile:
         try:
             array: NDArray[Any] = np.load(self.path, mmap_mode="r")
         except Exception as error:
-            # NumPy reads the header as Python, and raises whatever that raises when it is damaged.
+            # NumPy parses the header as Python, and raises whatever that raises on a damaged one.
             told = " ".join(str(error).split())[:200]
             self._refuse(f"damaged or no array: {told}; write it again")
         if array.ndim == 3 and array.shape[0] != 3 and array.shape[2] == 3:

@@ -1,7 +1,7 @@
-"""What a file says of its colours: its codes as sRGB codes, or as absolute light.
+"""What a file states about its colours: its codes as sRGB codes, or as absolute light.
 
-What wins where a file says several things: cICP, then an ICC profile, then sRGB, then gAMA and
-cHRM (PNG, third edition, 4.3). Colours that sRGB lacks lie outside [0, 1].
+Where a file states several things, cICP takes precedence, then an ICC profile, then sRGB, then gAMA
+and cHRM (PNG, third edition, 4.3). Colours outside sRGB's gamut lie outside [0, 1].
 """
 
 from typing import NamedTuple
@@ -37,22 +37,22 @@ PRIMARIES = {1: BT709, 9: BT2020, 11: DCI_P3, 12: P3}
 VIDEO = (1, 6, 14, 15)
 GAMMA22, GAMMA28, LINEAR, SRGB, PQ, HLG = 4, 5, 8, 13, 16, 18
 
-# A stated gamma within this of 1 / 2.2 stands for sRGB's curve, as writers of sRGB state it
-# (PNG, third edition, 11.3.2.5), where the primaries are sRGB's too. Status: choice.
+# A stated gamma within this of 1 / 2.2 means sRGB's curve, as writers of sRGB state it (PNG, third
+# edition, 11.3.2.5), where the primaries are sRGB's too. Status: choice.
 NEAR_GAMMA = 0.01
 
 
 class Colour(NamedTuple):
-    """What a file says."""
+    """What a file states about its colours."""
 
     cicp: tuple[int, int, int, int] | None = None
     """Primaries, transfer, matrix and range of ITU-T H.273."""
     profile: bytes | None = None
     """An ICC profile."""
     srgb: bool = False
-    """Whether it says that it is sRGB."""
+    """Whether it states that it is sRGB."""
     gamma: float | None = None
-    """The exponent by which light became code."""
+    """The encoding exponent, from light to code."""
     chromaticities: Chromaticities | None = None
     """x, y of red, green, blue and white."""
 
@@ -69,7 +69,7 @@ def shown(codes: Floats, colour: Colour, bits: int, notes: list[str]) -> tuple[F
 
 
 def check_cicp(cicp: tuple[int, int, int, int]) -> None:
-    """Refuse colours that are not known."""
+    """Refuse colours that are not supported."""
     space, transfer, matrix, _ = cicp
     known = (*VIDEO, GAMMA22, GAMMA28, LINEAR, SRGB, PQ, HLG)
     if space not in PRIMARIES or transfer not in known or matrix != 0:

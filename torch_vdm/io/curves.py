@@ -1,6 +1,6 @@
 """Transfer curves: from the code that a file stores to light, and to sRGB's code.
 
-Codes and light from 0 to 1 unless said otherwise; arrays of any shape and float type.
+Codes and light are from 0 to 1 unless stated otherwise, in arrays of any shape and float type.
 """
 
 from typing import Any, TypeAlias
@@ -28,7 +28,7 @@ BT1886_EXPONENT = 2.4
 
 
 def decode_srgb(code: Values) -> Values:
-    """Return the light of sRGB codes, as a display has it; below 0 the linear part goes on."""
+    """Return the light of sRGB codes on a display; below 0 the linear part continues."""
     return display.decode_srgb(torch.from_numpy(np.ascontiguousarray(code))).numpy()
 
 
@@ -38,12 +38,12 @@ def encode_srgb(light: Values) -> Values:
 
 
 def decode_gamma(code: Values, exponent: float) -> Values:
-    """Return the light of codes that are its power 1 / exponent; odd about 0."""
+    """Return the light of codes, their power ``exponent``; an odd function."""
     return np.sign(code) * np.abs(code) ** exponent
 
 
 def decode_pq(code: Values) -> Values:
-    """Return the light of PQ codes, cd/m2."""
+    """Return the light of PQ codes, in cd/m2."""
     root = np.clip(code, 0, 1) ** (1 / PQ_M2)
     return PQ_PEAK * (np.maximum(root - PQ_C1, 0) / (PQ_C2 - PQ_C3 * root)) ** (1 / PQ_M1)
 
@@ -57,5 +57,5 @@ def decode_hlg(code: Values, weights: Values) -> Values:
     bright = (np.exp((np.maximum(code, 0.5) - HLG_C) / HLG_A) + HLG_B) / 12
     scene = np.where(code <= 0.5, code**2 / 3, bright)
     luminance = np.tensordot(weights, scene, 1)
-    # 0 to the power 0.2 is 0, and so is all of such a pixel.
+    # 0 to the power 0.2 is 0, and so is the whole pixel.
     return HLG_PEAK * scene * luminance ** (HLG_GAMMA - 1)

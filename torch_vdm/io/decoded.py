@@ -11,7 +11,7 @@ Kind: TypeAlias = Literal["coded", "scene", "absolute"]
 
 
 class Decoded(NamedTuple):
-    """An image as a file has it, before its transparency is dealt with."""
+    """An image as a file has it, before it is composited over a background."""
 
     pixels: Floats
     """(3, H, W)."""
@@ -21,4 +21,4 @@ class Decoded(NamedTuple):
     associated: bool = False
     """Whether the colours are already multiplied by alpha."""
     views: tuple[str, ...] = ()
-    """The names of the views (eyes) of a multi-view file, the first the one that is shown."""
+    """The names of the views (eyes) of a multi-view file; the first is the one that is shown."""

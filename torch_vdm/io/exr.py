@@ -1,8 +1,8 @@
 """The OpenEXR container.
 
-A file is taken apart here, before the OpenEXR library sees any of it: only the blocks of pixels of
-the part that is wanted reach the library, behind a new header of nine attributes. So a damaged,
-truncated or hostile file is refused before memory is set aside for it, attributes that the library
+A file is parsed here, before the OpenEXR library sees any of it: only the blocks of pixels of the
+part that is wanted reach the library, behind a new header of nine attributes. So a damaged,
+truncated or hostile file is refused before memory is allocated for it, attributes that the library
 does not know do no harm, and a part that is not wanted costs nothing.
 
 OpenEXR is imported where it is used: importing the package stays fast.
@@ -37,7 +37,7 @@ _BLOCK_ROWS = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256, 256, 32, 256, 1)
 
 
 class Choice(NamedTuple):
-    """Which of a file's images is asked for; None: the one that looks like the picture."""
+    """Which of a file's images is asked for; None: the one most like the picture."""
 
     part: int | str | None = None
     view: str | None = None
@@ -63,7 +63,7 @@ def load_exr(data: Bytes, choice: Choice, repair: Repair, coded: bool, notes: li
 
 
 def _check(part: Part, size: int) -> None:
-    """Refuse a header of which the library would have to trust something."""
+    """Refuse a header with anything that the library would have to trust."""
     width, height = part.size
     samples = 0
     for name, channel in part.channels.items():
@@ -85,12 +85,12 @@ def _check(part: Part, size: int) -> None:
         columns, rows, _ = value_of(part.attributes, "tiles", "<IIB")
         if columns == 0 or rows == 0:
             raise damaged(f"its tiles are {columns} x {rows} pixels")
-        # The library sets memory aside for a whole tile even where the image is smaller.
+        # The library allocates memory for a whole tile even where the image is smaller.
         check_size(columns, rows, columns * rows * 4 * len(part.channels), size)
 
 
 def _blocks(data: Bytes, part: Part, table: int, index: int | None) -> list[tuple[bytes, bytes]]:
-    """Every block of the full-resolution image: where it stands in it, and its compressed data.
+    """Every block of the full-resolution image: its place in it, and its compressed data.
 
     `table` is where the part's table of offsets begins, `index` the number of the part in a file
     that has several. The first entries of a table are those of the full resolution.
@@ -101,7 +101,7 @@ def _blocks(data: Bytes, part: Part, table: int, index: int | None) -> list[tupl
     else:
         columns, rows = width, _BLOCK_ROWS[value_of(part.attributes, "compression", "<B")[0]]
     across, down = -(-width // columns), -(-height // rows)
-    # Before a list is made of them: a file of some bytes may declare millions.
+    # Checked before a list is built: a file of a few bytes may declare millions.
     if table < 0 or table + 8 * across * down > len(data):
         raise ImageError(
             f"incomplete: the file ends in the table of its {across * down} blocks of pixels; "
@@ -142,9 +142,9 @@ def _blocks(data: Bytes, part: Part, table: int, index: int | None) -> list[tupl
 
 
 def _largest_block(part: Part) -> int:
-    """Bytes that a block may have: what does not become smaller is stored as it is.
+    """The most bytes that a block may have: data that does not shrink is stored as it is.
 
-    Twice that and a bit, for compressions that keep tables of their own.
+    The limit is twice that and a bit, for compressions that keep tables of their own.
     """
     if part.tiled:
         columns, rows, _ = value_of(part.attributes, "tiles", "<IIB")

@@ -23,12 +23,13 @@ from torch_vdm.io.refusal import (
     without_negatives,
 )
 
-# Half of the symmetric filter that makes the chroma between two samples; the first tap is for the
-# nearest. A windowed sinc, 27 pixels wide: OpenEXR, ImfRgbaYca.cpp, reconstructChromaHoriz.
+# Half of the symmetric filter that interpolates the chroma between two samples; the first tap is
+# for the nearest. It is a windowed sinc, 27 pixels wide: OpenEXR, ImfRgbaYca.cpp,
+# reconstructChromaHoriz.
 CHROMA_TAPS = (0.627123, -0.186077, 0.087929, -0.043159, 0.019597, -0.007540, 0.002128)
 
 
-# The largest finite number of a channel's type: whole numbers are finite, half, float.
+# The largest finite number of a channel's type: whole numbers (always finite), half, float.
 LARGEST = (np.float32(2**32), np.float32(65504), np.finfo(np.float32).max)
 
 
@@ -65,7 +66,7 @@ def colours(
     else:
         image = _placed(np.stack(_whole(planes, steps, layer.channels)), part, notes)
         image = require_finite(image, repair.nonfinite, notes, largest=largest)
-    # The file's own: conversion makes others, of colours that BT.709 lacks, and these are legal.
+    # Only the file's own: conversion of colours outside BT.709 makes others, which are legal.
     image = without_negatives(image, repair.negative, notes)
     if layer.model == ("Y",):
         notes.append("The image is grey (channel Y): R = G = B.")
@@ -75,12 +76,12 @@ def colours(
     else:
         image = _to_bt709(image, part, layer.model == ("X", "Y", "Z"), notes)
     _note_scale(part, notes)
-    # Once more: what was finite in the file may overflow on the way.
+    # Once more: what was finite in the file may overflow in the conversion.
     return require_finite(image, repair.nonfinite, notes)
 
 
 def transparency(part: Part, name: str, decoded: dict[str, Floats], notes: list[str]) -> Floats:
-    """A channel of alpha, (H, W) of the display window's size."""
+    """An alpha channel, (H, W) of the display window's size."""
     planes = _whole([decoded[name].astype(np.float32)], [part.channels[name].step], (name,))
     return alpha.plane(_placed(np.stack(planes), part, [])[0], notes)
 
@@ -111,14 +112,15 @@ def _from_luminance_chroma(luminance: Floats, chroma: Floats, weights: Matrix) -
 
 
 def _less_saturated(image: Floats, weights: Matrix) -> Floats:
-    """Take back colour that the filter made up: where a pixel is saturated and its neighbours not.
+    """Remove colour that the filter made up: where a pixel is saturated and its neighbours are not.
 
     Saturation is 1 - min / max of R, G, B. It may exceed the mean m of the four neighbours only up
-    to 1 - (1 - m) / 4; beyond, the colour is pulled towards grey at the same luminance. So negative
-    values, of saturation over 1, vanish. The rule is OpenEXR's (ImfRgbaYca.cpp, fixSaturation).
+    to 1 - (1 - m) / 4; beyond that, the colour is pulled towards grey at the same luminance. So
+    negative values, with a saturation over 1, vanish. The rule is OpenEXR's (ImfRgbaYca.cpp,
+    fixSaturation).
     """
     high = image.max(0)
-    with np.errstate(all="ignore"):  # infinite values are dealt with by the caller
+    with np.errstate(all="ignore"):  # infinite values are handled by the caller
         saturation = np.where(high > 0, 1 - image.min(0) / high, np.float32(0))
         wide = np.pad(saturation, 1, mode="edge")
         mean = (wide[1:-1, :-2] + wide[1:-1, 2:] + wide[:-2, 1:-1] + wide[2:, 1:-1]) / 4
@@ -131,7 +133,7 @@ def _less_saturated(image: Floats, weights: Matrix) -> Floats:
 
 
 def _doubled(samples: Floats) -> Floats:
-    """Twice the columns: the samples, and between two what the filter makes of those around."""
+    """Twice the columns: the samples, and between them those that the filter interpolates."""
     count, reach = samples.shape[-1], len(CHROMA_TAPS)
     wide = np.pad(samples, ((0, 0), (0, 0), (reach - 1, reach)), mode="edge")
     between = np.zeros_like(samples)
@@ -181,7 +183,7 @@ def _to_bt709(image: Floats, part: Part, is_xyz: bool, notes: list[str]) -> Floa
     """Convert primaries, and the white by the Bradford transform.
 
     Grey stays grey: the file's white becomes BT.709's. XYZ has no white of its own, so X, Y, Z are
-    converted as they are, unless an adoptedNeutral says what is to look white.
+    converted as they are, unless an adoptedNeutral states what is to look white.
     """
     if "chromaticities" not in part.attributes and not is_xyz:
         notes.append("No chromaticities are given: BT.709 is assumed, as the format prescribes.")
@@ -204,7 +206,7 @@ def _to_bt709(image: Floats, part: Part, is_xyz: bool, notes: list[str]) -> Floa
 
 
 def _require_bt709(part: Part, layer: Layer) -> None:
-    """Refuse what a conversion would be needed for that coded values do not allow."""
+    """Refuse colours that need a conversion, which coded values do not allow."""
     matrix = np.eye(3)
     if "chromaticities" in part.attributes:
         given = _chromaticities(part)
@@ -216,7 +218,7 @@ def _require_bt709(part: Part, layer: Layer) -> None:
 
 
 def _note_scale(part: Part, notes: list[str]) -> None:
-    """Say what the file states and the pixels do not carry."""
+    """Note what the file states and the pixels do not carry."""
     if "whiteLuminance" in part.attributes:
         (white,) = value_of(part.attributes, "whiteLuminance", "<f")
         notes.append(f"The file states that 1.0 is {white:g} cd/m2; pass it with --white.")

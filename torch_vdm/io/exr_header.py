@@ -10,10 +10,10 @@ Window: TypeAlias = tuple[int, int, int, int]  # x min, y min, x max, y max; all
 
 
 class Bytes(Protocol):
-    """Bytes, or a file whose slices are read when they are asked for."""
+    """Bytes, or a file whose slices are read on demand."""
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Return how many bytes there are."""
 
     def __getitem__(self, part: slice, /) -> bytes:
         """Return a part of them."""
@@ -27,7 +27,7 @@ class Channel:
     """A channel of a part."""
 
     kind: int  # 0 unsigned integer, 1 half, 2 float
-    step: tuple[int, int]  # one sample every so many pixels in x, in y
+    step: tuple[int, int]  # one sample every so many pixels in x and in y
 
     @property
     def bytes(self) -> int:
@@ -45,7 +45,7 @@ class Part:
     tiled: bool
     channels: dict[str, Channel]
     window: Window  # where there are data
-    display: Window  # what is to be seen
+    display: Window  # what is to be shown
 
     @property
     def size(self) -> tuple[int, int]:
@@ -94,7 +94,7 @@ def _attributes(data: Bytes, at: int) -> tuple[dict[str, bytes], int]:
 
 
 def _text(data: Bytes, at: int) -> tuple[str, int]:
-    """The string that begins at `at`, and where the next thing begins."""
+    """The string that begins at `at`, and where the next field begins."""
     name, zero, _ = data[at : at + 256].partition(b"\0")
     if not zero:
         raise damaged("a name in the header does not end")
@@ -114,7 +114,7 @@ def _part(attributes: dict[str, bytes], flags: int) -> Part:
     if flags & _MULTIPART:
         deep, tiled = kind.startswith(b"deep"), kind in (b"tiledimage", b"deeptile")
     else:
-        # The flags rule: files exist whose type contradicts them.
+        # The flags take precedence: files exist whose type contradicts them.
         deep, tiled = bool(flags & _DEEP), bool(flags & TILED)
     data = attributes.get("channels", b"")
     channels: dict[str, Channel] = {}

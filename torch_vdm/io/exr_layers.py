@@ -7,11 +7,11 @@ from typing import NamedTuple
 from torch_vdm.io.exr_header import Part, listed, short
 from torch_vdm.io.refusal import ImageError
 
-# Channels that make an image, in the order in which they are looked for.
+# Channels that make an image, in the order in which they are searched for.
 MODELS = (("R", "G", "B"), ("Y", "RY", "BY"), ("X", "Y", "Z"), ("Y",))
 RGB = MODELS[0]
 
-# What renderers call red, green, blue and alpha, in letters of either case.
+# Renderers' names for red, green, blue and alpha, in either case.
 _WORDS = {
     "R": ("r", "red"),
     "G": ("g", "green"),
@@ -19,11 +19,11 @@ _WORDS = {
     "A": ("a", "alpha"),
 }
 
-# Those that are a picture, and nothing else: X, Y, Z may be positions, and Y a depth.
+# Models that can only be a picture: X, Y, Z may be positions, and Y a depth.
 _PICTURES = MODELS[:2]
 
-# What the picture is called among layers that only go into it, in letters of either case: Blender's
-# and V-Ray's, Redshift's; and, as a whole name (albedo.color is none), Arnold's and Nuke's.
+# Names of the picture among layers that only contribute to it, in either case: Blender's and
+# V-Ray's, Redshift's; and, as a whole name (albedo.color does not count), Arnold's and Nuke's.
 # Status: choice.
 _BEAUTY = ("combined", "beauty")
 _BEAUTY_WHOLE = ("rgba", "rgb", "color", "colour")
@@ -34,9 +34,9 @@ class Layer(NamedTuple):
 
     part: int
     name: str
-    """Of the layer, with the part's before it where there are several; without the view's."""
+    """The layer's name, after the part's where there are several; without the view's."""
     prefix: str
-    """What stands before the last dot of the channels' names."""
+    """The channels' names up to their last dot."""
     view: str
     """The eye; "" in a file that is not multi-view."""
     model: tuple[str, ...]
@@ -77,7 +77,7 @@ def _best(parts: list[Part], candidates: list[Layer]) -> list[Layer]:
     best = min(map(rank, candidates))
     same = [layer for layer in candidates if rank(layer) == best]
     _refuse_deep(parts[same[0].part])
-    # Layers that differ in nothing but the view are one picture.
+    # Layers that differ only in the view are one picture.
     if len({layer.name for layer in same}) > 1 or len({layer.view for layer in same}) < len(same):
         raise ImageError(
             f"expected one image, got the layers {listed(_titles(parts, same))}; choose one with "
@@ -88,7 +88,7 @@ def _best(parts: list[Part], candidates: list[Layer]) -> list[Layer]:
 
 
 def _likeness(layer: Layer) -> int:
-    """How little a layer looks like the picture; those of the same number are as good."""
+    """How little a layer looks like the picture; layers of the same number are equally good."""
     own = layer.prefix in ("", layer.view)
     picture = layer.model in _PICTURES
     name = layer.name.lower()
@@ -96,13 +96,13 @@ def _likeness(layer: Layer) -> int:
         return 0 if layer.model == RGB else 1
     if name in _BEAUTY_WHOLE or name.rpartition(".")[2] in _BEAUTY:
         return 2 if layer.model == RGB else 3
-    if own and picture:  # of a part
+    if own and picture:  # the channels of a part
         return 4 if layer.model == RGB else 5
     return 6
 
 
 def _candidates(parts: list[Part], wanted: int | str | None) -> list[Layer]:
-    """The layers among which `wanted` leaves the choice."""
+    """The layers that `wanted` leaves to choose from."""
     found = list(_layers(parts))
     usual = [layer for layer in found if layer.prefix in ("", layer.view) or layer.model == RGB]
     indices: Sequence[int] = range(len(parts))
@@ -115,7 +115,7 @@ def _candidates(parts: list[Part], wanted: int | str | None) -> list[Layer]:
         if not indices:
             return _layers_called(parts, found, wanted)
     candidates = [layer for layer in usual if layer.part in indices]
-    if wanted == "":  # what belongs to no layer
+    if wanted == "":  # the channels of no layer
         candidates = [layer for layer in candidates if layer.prefix in ("", layer.view)]
     if not candidates:
         part = parts[indices[0]]
@@ -128,7 +128,7 @@ def _candidates(parts: list[Part], wanted: int | str | None) -> list[Layer]:
 
 
 def _layers_called(parts: list[Part], found: list[Layer], wanted: str) -> list[Layer]:
-    """The layers of which `wanted` is the whole name, else the last word, else so but for case."""
+    """The layers whose whole name is `wanted`, else the last word, else either ignoring case."""
     for fold in (str, str.lower):
         for names in (
             lambda layer: (layer.prefix, layer.name),
@@ -170,9 +170,9 @@ def _layers(parts: list[Part]) -> Iterator[Layer]:
 
 
 def _groups(part: Part) -> dict[str, dict[str, str]]:
-    """By prefix: the channels' full names by what they are, "R", "G", "B", "A" or their own."""
+    """By prefix: the channels' full names by "R", "G", "B", "A" or the channel's own name."""
     groups: dict[str, dict[str, str]] = {}
-    # "R" comes before ".R", "r" and "red": where there are several, it is the one.
+    # "R" comes before ".R", "r" and "red": where there are several, it is taken.
     for full in sorted(
         part.channels, key=lambda name: (len(name.rpartition(".")[2]), len(name), name)
     ):
@@ -189,7 +189,7 @@ def _views(parts: list[Part]) -> list[str]:
     for part in parts:
         value = part.attributes.get("multiView", b"")
         at = 0
-        while at + 4 <= len(value):  # a list of strings, each behind its length
+        while at + 4 <= len(value):  # a list of strings, each preceded by its length
             (length,) = struct.unpack_from("<i", value, at)
             if length < 0:
                 break
@@ -204,7 +204,7 @@ def _view_of(part: Part) -> str:
 
 
 def _split_view(prefix: str, views: list[str]) -> tuple[str, str]:
-    """The layer and the view of ``layer.view``, as the channels of a multi-view part have it."""
+    """The layer and the view of ``layer.view``, as channels of a multi-view part are named."""
     layer, _, last = prefix.rpartition(".")
     return (layer, last) if last in views else (prefix, "")
 

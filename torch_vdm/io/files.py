@@ -1,4 +1,4 @@
-"""Images from files and to files, whole or not at all."""
+"""Images read from files, and written to files whole or not at all."""
 
 import contextlib
 import ctypes
@@ -31,10 +31,10 @@ from torch_vdm.io.tiff import load_tiff
 
 PathLike: TypeAlias = str | os.PathLike[str]
 
-# Which suffixes are written.
+# Suffixes that can be written.
 FORMATS = {".exr": "OpenEXR", ".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 
-# What a file of a name is expected to hold.
+# The format that a suffix promises.
 SUFFIXES = FORMATS | {
     ".hdr": "HDR",
     ".pic": "HDR",
@@ -53,7 +53,7 @@ SUFFIXES = FORMATS | {
     ".jxl": "JPEG XL",
 }
 
-# The first bytes of each; TGA has none.
+# The first bytes of each format; TGA has none.
 MAGIC = (
     ("OpenEXR", rb"\x76\x2f\x31\x01"),
     ("PNG", rb"\x89PNG\r\n\x1a\n"),
@@ -69,29 +69,29 @@ MAGIC = (
     ("JPEG XL", rb"\xff\x0a|\0\0\0\x0cJXL "),
 )
 
-# Those whose pixels are light, and those that may be: floating point in a TIFF.
+# Formats whose pixels are light; those of a TIFF may be, in floating point.
 SCENE = ("OpenEXR", "HDR", "PFM")
 
-# The largest file that is read whole, bytes: all but OpenEXR, of which only what is wanted is read.
-# Twice what the largest image takes with 64 bits a channel. Status: choice.
+# The largest file that is read whole, in bytes; of OpenEXR only what is wanted is read. It is twice
+# what the largest image takes with 64 bits per channel. Status: choice.
 LARGEST_FILE = 2**32
 
-# The bytes that tell what a file is.
+# The first bytes that identify a file's format.
 HEAD = 64
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """An image and what was assumed to read it.
+    """An image and what was assumed in reading it.
 
     Attributes
     ----------
     pixels
         float32, shape (3, H, W), over the background where the file is transparent.
     kind
-        What they are. "coded": sRGB-coded, 0 to 1; colours that sRGB lacks lie outside. "scene":
-        linear BT.709, where 1.0 is what the scene calls white. "absolute": linear BT.709 in cd/m2
-        (PQ, HLG).
+        What the pixels are. "coded": sRGB-coded, 0 to 1; colours that sRGB lacks lie outside.
+        "scene": linear BT.709, where 1.0 is what the scene calls white. "absolute": linear BT.709
+        in cd/m2 (PQ, HLG).
     notes
         One sentence for every assumption and every repair, in the order in which they were made.
     content
@@ -133,15 +133,15 @@ def read_image(
 
     Returns
     -------
-    float32, shape (3, H, W). Scene-linear BT.709 from OpenEXR, Radiance .hdr, PFM and TIFF of
-    floating point. sRGB-coded from all else: in [0, 1], but for colours that sRGB lacks, of files
-    that say that they have such, which lie outside.
+    float32, shape (3, H, W): scene-linear BT.709 from OpenEXR, Radiance .hdr, PFM and TIFF of
+    floating point; sRGB-coded from all else, in [0, 1] except for colours that sRGB lacks, in files
+    that declare them.
 
     Raises
     ------
     ImageError
-        As `load` does; and where the pixels are none of both, or others than the file's name
-        promises: absolute light (PQ, HLG), an OpenEXR file called .png. `load` reads these.
+        As `load` does; and where the pixels are neither, or not what the file's name promises:
+        absolute light (PQ, HLG), an OpenEXR file called .png. `load` reads these.
     """
     image = load(path, part=part, nonfinite=nonfinite, negative=negative, background=background)
     named = SUFFIXES.get(Path(path).suffix.lower(), image.content)
@@ -167,19 +167,19 @@ def load(
     coded: bool = False,
     quiet: bool = False,
 ) -> Image:
-    """Read an image file, and say what was assumed.
+    """Read an image file, and report what was assumed.
 
-    The content decides the format; the name is used in messages, and where TGA is meant. What is
-    read of which format, and what is refused: docs/files.md.
+    The content decides the format; the name is used in messages, and to recognize TGA. What is read
+    of which format, and what is refused, is in docs/files.md.
 
-    OpenEXR: channels R, G, B (r, red, .R), else Y, RY, BY (luminance and chroma), of no layer, else
-    of a layer called Combined, beauty, rgba, color or colour, else of the only layer there is; or
-    X, Y, Z (CIE) or Y (grey) of no layer where there is nothing else. Primaries other than BT.709's
-    are converted. The image has the size of the display window. Of a tiled file with several levels
-    the full resolution is read. Deep files are refused.
+    OpenEXR: channels R, G, B (r, red, .R), else Y, RY, BY (luminance and chroma), are read from no
+    layer, else from a layer called Combined, beauty, rgba, color or colour, else from the only
+    layer there is; X, Y, Z (CIE) or Y (grey) of no layer if there is nothing else. Primaries other
+    than BT.709's are converted. The image has the size of the display window. Of a tiled file with
+    several levels the full resolution is read. Deep files are refused.
 
-    Other formats: grey, palette and 16-bit files too. What a file says of its colours (cICP, ICC
-    profile, gAMA and cHRM) and of its orientation is followed. CMYK, animations and several
+    Other formats: grey, palette and 16-bit files are read too. What a file states about its colours
+    (cICP, ICC profile, gAMA and cHRM) and its orientation is applied. CMYK, animations and several
     pictures in a file are refused.
 
     Parameters
@@ -188,31 +188,31 @@ def load(
         The file.
     part
         Which part of an OpenEXR file: its index from 0, its name, or the name of a layer, whole
-        (``ViewLayer.Combined``) or its last word, or "" for what belongs to no layer. None: what
-        looks like the picture.
+        (``ViewLayer.Combined``) or its last word, or "" for the channels of no layer. None: what
+        looks most like the picture.
     view
         Which view of a multi-view OpenEXR file. None: the first.
     channels
         The names of the OpenEXR channels to take for "R", "G", "B" and perhaps "A".
     nonfinite
-        What to do about NaN and infinity: refuse the file, put 0 in their place, or hold infinity
-        to the largest finite value of the channel's type (65504 for half) and NaN to the mean of
-        its finite neighbours, or 0.
+        What to do about NaN and infinity: refuse the file, put 0 in their place, or clamp infinity
+        to the largest finite value of the channel's type (65504 for half) and set NaN to the mean
+        of its finite neighbours, or 0.
     negative
         What to do about negative linear values that the file has: keep them, refuse the file, or
-        put 0 in their place. Those that come of a conversion to BT.709 are kept.
+        put 0 in their place. Those that result from a conversion to BT.709 are kept.
     background
         What is seen through a transparent image: black, white, grey or #rrggbb, sRGB-coded; white
-        is 1.0 of linear values and 203 cd/m2 of absolute ones. sRGB-coded values are composited as
+        is 1.0 in linear values and 203 cd/m2 in absolute ones. sRGB-coded values are composited as
         they are, light as light; colours that are associated with alpha (OpenEXR, some TIFF) are
         not multiplied by it again.
     coded
-        Take values of light (OpenEXR, .hdr, PFM, TIFF of floating point) for sRGB-coded ones.
+        Take values of light (OpenEXR, .hdr, PFM, TIFF of floating point) as sRGB-coded ones.
     quiet
         Keep the libraries from printing. The OpenEXR library writes to standard output and standard
-        error by itself when the data inside a block is damaged. To hold that back, file descriptors
+        error by itself when the data inside a block is damaged. To suppress that, file descriptors
         1 and 2 and ``sys.stdout`` lead nowhere while the file is decoded, in every thread, and
-        child processes started meanwhile inherit that: for command lines, not for libraries.
+        child processes started meanwhile inherit that: use it in command lines, not in libraries.
 
     Returns
     -------
@@ -225,7 +225,7 @@ def load(
         89 million pixels) or without colour channels, or if its values are refused. The message
         is one line that names the file.
     MemoryError
-        If it does not fit into memory; it names the file too.
+        If it does not fit into memory; the message names the file too.
     """
     for name, value, known in (
         ("nonfinite", nonfinite, ("raise", "zero", "clamp")),
@@ -233,7 +233,7 @@ def load(
     ):
         if value not in known:
             raise ValueError(f"expected {name} to be one of {known}, got {value!r}")
-    colour(background)  # refuses what is none
+    colour(background)  # refuses an unknown one
     try:
         notes: list[str] = []
         with _hushed() if quiet else contextlib.nullcontext():
@@ -266,14 +266,14 @@ def write_image(path: PathLike, image: Tensor) -> None:
     Parameters
     ----------
     path
-        The file; one that exists is replaced once the new one is complete.
+        The file; an existing one is replaced once the new one is complete.
     image
         Shape (3, H, W), or (1, H, W) or (H, W) for grey; any float type, any device.
 
     Raises
     ------
     ImageError
-        If the suffix is not known, the shape or type is another one, a value for PNG or JPEG is not
+        If the suffix is not known, the shape or type does not fit, a value for PNG or JPEG is not
         finite, or the file cannot be written.
     """
     suffix = Path(path).suffix.lower()
@@ -310,11 +310,11 @@ def write_channels(path: PathLike, channels: Mapping[str, Tensor]) -> None:
     Parameters
     ----------
     path
-        The file, whose name ends in ``.exr``; one that exists is replaced once the new one is
+        The file, whose name ends in ``.exr``; an existing one is replaced once the new one is
         complete.
     channels
-        Planes (H, W) of one size by the names of their channels. R, G, B are linear BT.709; others
-        are what their names say.
+        Planes (H, W) of one size by channel name. R, G, B are linear BT.709; others are what their
+        names say.
 
     Raises
     ------
@@ -341,8 +341,8 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
     """Write a file whole or not at all.
 
     ``with atomic_path("out.json") as temporary: temporary.write_text(...)``. The temporary file
-    lies in the folder of `path` and has the same suffix. It takes the place of `path` when the
-    block ends; if the block raises, it is removed and `path` is left as it was.
+    lies in the folder of `path` and has the same suffix. It replaces `path` when the block ends; if
+    the block raises, it is removed and `path` is left as it was.
 
     Parameters
     ----------
@@ -356,7 +356,7 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         refuses to write.
     """
     target = Path(os.path.realpath(path))
-    # Not tempfile.mkstemp: its files can be read by their owner only, and so would the result.
+    # Not tempfile.mkstemp: only their owner could read its files, and so the result.
     temporary = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
     ours = {str(name) for name in (None, temporary, target, target.parent)}
     try:
@@ -374,7 +374,7 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
 
 
 def check_target(target: Path) -> None:
-    """Refuse what `atomic_path` could not put a file in the place of."""
+    """Refuse what `atomic_path` could not replace with a file."""
     if not target.parent.is_dir():
         raise ImageError(f"{target}: expected the folder to exist; create it first")
     # Renaming over a folder fails, and over a device such as /dev/null replaces the device.
@@ -383,7 +383,7 @@ def check_target(target: Path) -> None:
 
 
 class _Slices:
-    """A file of which parts are read when they are asked for."""
+    """A file whose slices are read on demand."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._file, self._size = file, size
@@ -440,7 +440,7 @@ def _decoded_whole(
         image = load_hdr(data, repair.nonfinite, notes)
         return image._replace(kind="coded") if coded else image
     if content == "JPEG XL":
-        # The libraries for Python tell neither how many pictures there are nor their colours.
+        # The libraries for Python report neither how many pictures there are nor their colours.
         raise ImageError(
             "expected another format, got JPEG XL; convert it to PNG with libjxl's djxl"
         )
@@ -451,7 +451,7 @@ def _decoded_whole(
 def _opened(path: PathLike) -> Iterator[BinaryIO]:
     file = Path(path)
     try:
-        # Asked first, since opening a pipe that nobody writes to would wait for ever.
+        # Checked first, since opening a pipe that nobody writes to would wait for ever.
         status = file.stat()
     except FileNotFoundError as error:
         raise ImageError("no such file; check the name") from error
@@ -519,7 +519,7 @@ def _hushed() -> Iterator[None]:
 
 def _flush_c() -> None:
     # OpenJPH, inside the OpenEXR library, prints to the C library's standard output, which is
-    # buffered: what it has to say would come out after the descriptor is back. Where the C library
-    # cannot be reached this way (Windows), that is so.
+    # buffered: its output would appear after the descriptor is restored. Where the C library cannot
+    # be reached this way (Windows), it does.
     with contextlib.suppress(OSError, TypeError, AttributeError):
         ctypes.CDLL(None).fflush(None)

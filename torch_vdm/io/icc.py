@@ -1,7 +1,7 @@
 """ICC profiles: what the codes of a file mean.
 
-Profiles of a matrix and curves, as nearly all RGB profiles are, are taken apart here: Pillow's lcms
-has 8 bits a channel and no colours outside sRGB. Those made of tables go through lcms.
+Profiles of a matrix and curves, as nearly all RGB profiles are, are parsed here: Pillow's lcms has
+8 bits per channel and no colours outside sRGB. Those made of tables go through lcms.
 """
 
 import io
@@ -17,7 +17,7 @@ from torch_vdm.io.refusal import Floats, ImageError
 
 Curve: TypeAlias = Callable[[Values], Values]
 
-# Codes that differ by less are the same: half a step of 8 bits. Status: choice.
+# Codes that differ by less count as equal: half a step of 8 bits. Status: choice.
 SAME_CODE = 0.5 / 255
 
 
@@ -57,12 +57,12 @@ class Profile(NamedTuple):
 
 
 def read_profile(data: bytes) -> Profile:
-    """Take an ICC profile apart.
+    """Parse an ICC profile.
 
     Raises
     ------
     ImageError
-        If it is damaged, or of something else than grey or R, G, B.
+        If it is damaged, or of anything but grey or R, G, B.
     """
     try:
         return _read_profile(data)
@@ -71,7 +71,7 @@ def read_profile(data: bytes) -> Profile:
 
 
 def stated(info: Mapping[Any, object]) -> bytes | None:
-    """The profile in what Pillow tells of a file; None where the file has none.
+    """The profile in Pillow's info of a file; None where the file has none.
 
     Raises
     ------
@@ -173,7 +173,7 @@ def _formula(
     f: float = 0.0,
 ) -> Curve:
     """(a X + b)^g + e from a code X = d on, c X + f below: ICC.1:2022, table 68."""
-    if kind in (1, 2):  # there c is what is added everywhere, and d is where the base is 0
+    if kind in (1, 2):  # there c is added everywhere, and d is where the base is 0
         c, d, e, f = 0.0, -b / a, c, c
     elif kind == 0:
         d = -np.inf

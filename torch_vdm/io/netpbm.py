@@ -46,14 +46,14 @@ def load_pnm(data: bytes, notes: list[str]) -> Decoded:
 
 
 def _packed(data: bytes, at: int, height: int, width: int) -> NDArray[Any]:
-    """Bits, of which every row begins with a byte of its own."""
+    """Bits; every row begins with a new byte."""
     check_size(width, height, height * width, len(data))
     stored = _pixels(data, at, (height, -(-width // 8), 1), np.dtype("u1"))
     return np.unpackbits(stored, axis=1)[:, :width]
 
 
 def _written(data: bytes, at: int, shape: tuple[int, int, int], white: int) -> NDArray[Any]:
-    """Numbers in letters; the digits of a PBM need no space between them."""
+    """Numbers as text; the digits of a PBM need no space between them."""
     height, width, samples = shape
     count = height * width * samples
     check_size(width, height, 8 * count, len(data))
@@ -98,7 +98,7 @@ def load_pfm(data: bytes, repair: Repair, notes: list[str]) -> Decoded:
 
 
 def _scale(text: bytes) -> float:
-    """The number whose sign is the order of bytes."""
+    """The scale, whose sign is the order of bytes."""
     try:
         scale = float(text)
     except ValueError:
@@ -115,7 +115,7 @@ def _pixels(
     size = height * width * samples * stored.itemsize
     check_size(width, height, size, len(data))
     if len(data) == at + size + 1 and data[at - 1 : at + 1] == b"\r\n":
-        at += 1  # the line's end of a header that was written on Windows
+        at += 1  # the line ending of a header that was written on Windows
     if at + size > len(data):
         raise ImageError(
             f"incomplete: {len(data) - at} of {size} bytes of pixels are there; copy it again"

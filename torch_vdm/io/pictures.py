@@ -28,7 +28,7 @@ ORIENTATION, EXIF, INTEROP, COLOUR_SPACE, UNCALIBRATED = 0x0112, 0x8769, 0xA005,
 ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
 ADOBE_GAMMA = 256 / 563
 
-# Where Pillow reads a format: module, class, and what to install where the module is missing.
+# Pillow's reader of a format: module, class, and what to install where the module is missing.
 READERS = {
     "JPEG": ("PIL.JpegImagePlugin", "jpeg_factory", "Pillow"),
     "WebP": ("PIL.WebPImagePlugin", "WebPImageFile", "Pillow with WebP"),
@@ -39,7 +39,7 @@ READERS = {
     "AVIF": ("PIL.AvifImagePlugin", "AvifImageFile", "Pillow 11.3 or newer"),
 }
 
-# What Pillow calls pixels of 8 bits that have colours to be shown.
+# Pillow's modes for pixels of 8 bits that have colours to be shown.
 MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX")
 
 
@@ -48,7 +48,7 @@ def load_picture(
 ) -> Decoded:
     """Return the image of a file; what was assumed goes to ``notes``.
 
-    ``chromaticities`` are those that the file states, where Pillow does not tell.
+    ``chromaticities`` are those that the file states, where Pillow does not report them.
     """
     try:
         with _opened(data, content) as image:
@@ -56,14 +56,14 @@ def load_picture(
             if content != "TIFF":  # whose reader has counted the pages
                 _require_one_picture(image, notes)
             _require_shown(image, data, content, notes)
-            turn = orientation(image)  # a TIFF's is gone once it is loaded, and the image turned
+            turn = orientation(image)  # loading a TIFF drops it and turns the image
             image.load()
             values = _values(image, content == "TGA" and not _tga_has_alpha(data))
             profile = icc.stated(image.info)
     except (ImageError, MemoryError):
         raise
     except Exception as error:
-        # The decoders raise about every class there is when a file is damaged.
+        # The decoders raise almost any class of error when a file is damaged.
         raise ImageError(f"damaged {content} ({error}); export it again") from error
     colour = Colour(profile=profile, chromaticities=chromaticities)
     if content == "JPEG" and profile is None and _is_adobe_rgb(image):
@@ -105,7 +105,7 @@ def orientation(image: "Image", raw: bytes | None = None) -> int:
         if raw is not None and "exif" not in image.info:
             image.info["exif"] = raw
         turn = image.getexif().get(ORIENTATION, 1)
-    except Exception:  # EXIF data is an afterthought: damaged, it does not make the pixels unusable
+    except Exception:  # EXIF data is secondary: if damaged, the pixels are still usable
         return 1
     return turn if isinstance(turn, int) and 1 <= turn <= 8 else 1
 
@@ -123,7 +123,7 @@ def _is_adobe_rgb(image: "Image") -> bool:
 
 
 def turned(values: NDArray[Any], turn: int, notes: list[str]) -> NDArray[Any]:
-    """Return (H, W, C) as its EXIF orientation, which is TIFF's, says."""
+    """Return (H, W, C) turned by its EXIF orientation, which is TIFF's."""
     if turn != 1:
         notes.append(f"The image is turned as its EXIF orientation {turn} says.")
     # EXIF 2.3, 4.6.4 A: where row 0 and column 0 of the stored image are in the upright one.
@@ -150,7 +150,7 @@ def _opened(data: bytes, content: str) -> "ImageFile":
 
 
 def _require_one_picture(image: "ImageFile", notes: list[str]) -> None:
-    """Refuse several pictures, but not one with thumbnails or a gain map beside it."""
+    """Refuse several pictures, but not one with thumbnails or a gain map."""
     count = getattr(image, "n_frames", 1)
     multi = getattr(image, "mpinfo", None)  # a JPEG's list of pictures (CIPA DC-007)
     if multi is not None:
@@ -165,7 +165,7 @@ def _require_one_picture(image: "ImageFile", notes: list[str]) -> None:
 
 
 def _require_shown(image: "ImageFile", data: bytes, content: str, notes: list[str]) -> None:
-    """Refuse colours that Pillow would not give as they are meant."""
+    """Refuse colours that Pillow would not return as they are meant."""
     if image.mode not in MODES:
         raise ImageError(
             f"expected a grey or RGB image of 8 bits, got a {content} with {image.mode} colours, "
@@ -176,7 +176,7 @@ def _require_shown(image: "ImageFile", data: bytes, content: str, notes: list[st
         raise ImageError("expected sRGB, got a BMP with a colour profile; save it as PNG")
     if content != "AVIF":
         return
-    # ISO/IEC 23000-22: the colours are in a box of the header, and Pillow passes over them.
+    # ISO/IEC 23000-22: the colours are in a box of the header, which Pillow ignores.
     at = data.find(b"colrnclx")
     if at >= 0 and len(data) >= at + 12:
         primaries, transfer = struct.unpack_from(">HH", data, at + 8)

@@ -37,7 +37,7 @@ def load_png(data: bytes, notes: list[str]) -> Decoded:
     _require_one_picture(data)
     try:
         with PngImageFile(io.BytesIO(data)) as image:
-            image.verify()  # the check sums, which load() leaves out for the pixels
+            image.verify()  # the checksums, which load() skips for the pixels
         with PngImageFile(io.BytesIO(data)) as image:
             image.load()
             colour = _colour(data, image)
@@ -46,7 +46,7 @@ def load_png(data: bytes, notes: list[str]) -> Decoded:
     except (ImageError, MemoryError):
         raise
     except Exception as error:
-        # The decoders raise about every class there is when a file is damaged.
+        # The decoders raise almost any class of error when a file is damaged.
         raise ImageError(f"damaged PNG ({error}); export it again") from error
     if depth == 16:
         notes.append("The channels have 16 bits.")
@@ -76,17 +76,17 @@ def _values(
         return np.atleast_3d(np.asarray(image.convert("L" if grey else "RGB")))
     key = image.info.get("transparency")
     if kind == GREY and depth in (2, 4) and isinstance(key, int):
-        # Pillow spreads the pixels over 8 bits, but not the grey that is clear.
+        # Pillow scales the pixels to 8 bits, but not the grey that is transparent.
         image.info["transparency"] = key * 255 // (2**depth - 1)
     values = np.asarray(image.convert("RGBA"))
     return values[..., 2:] if grey else values
 
 
 def _grey_with_alpha(data: bytes) -> NDArray[np.uint16]:
-    """16 bits of grey and alpha, of which Pillow keeps 8 and kornia_rs knows nothing.
+    """16 bits of grey and alpha, where Pillow keeps 8 and kornia_rs does not read them.
 
-    A pixel has four bytes, as one of 8-bit RGBA has: read as such, with the header changed to say
-    so, they are all there.
+    A pixel has four bytes, like one of 8-bit RGBA: read as such, with the header changed to say so,
+    all of them are kept.
     """
     from PIL.PngImagePlugin import PngImageFile
 
@@ -98,7 +98,7 @@ def _grey_with_alpha(data: bytes) -> NDArray[np.uint16]:
 
 
 def _colour(data: bytes, image: "PngImageFile") -> Colour:
-    """What the file says of its colours."""
+    """What the file states about its colours."""
     stored = next((body for name, body in _chunks(data) if name == b"cICP"), None)
     cicp = None if stored is None else struct.unpack(">4B", stored)
     if cicp is not None:
@@ -124,7 +124,7 @@ def _require_one_picture(data: bytes) -> None:
     if animation is None or len(animation) < 4:
         return
     (count,) = struct.unpack_from(">I", animation)
-    # A picture without a frame control before it is not in the animation, but beside it.
+    # A picture without a frame control before it is not part of the animation.
     count += b"fcTL" not in names
     if count > 1:
         raise ImageError(
@@ -144,7 +144,7 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _raw_exif(image: "PngImageFile") -> bytes | None:
-    """EXIF data that ImageMagick and exiftool put into text, in hexadecimal digits."""
+    """EXIF data that ImageMagick and exiftool store as text, in hexadecimal digits."""
     for name in RAW_EXIF:
         text = image.info.get(name)
         if isinstance(text, str):
@@ -152,6 +152,6 @@ def _raw_exif(image: "PngImageFile") -> bytes | None:
             digits = text.split("\n", 3)[-1]
             try:
                 return bytes.fromhex("".join(digits.split()))
-            except ValueError:  # an afterthought: damaged, it does not make the pixels unusable
+            except ValueError:  # it is secondary: if damaged, the pixels are still usable
                 return None
     return None

@@ -1,4 +1,4 @@
-"""Colour spaces by their numbers: primaries, white, and the way to linear BT.709."""
+"""Colour spaces by their numbers: primaries, white, and the conversion to linear BT.709."""
 
 from typing import TypeAlias
 
@@ -23,7 +23,7 @@ XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
 # The white of ICC profiles' connection space, X, Y, Z. ICC.1:2022, 7.2.16.
 D50 = (0.9642, 1.0, 0.8249)
 
-# Chromaticities, or coefficients of a conversion, that differ by less are the same but for rounding
+# Chromaticities, or coefficients of a conversion, that differ by less are equal except for rounding
 # in the file (choice).
 SAME_COLOUR = 1e-3
 
@@ -50,7 +50,7 @@ def rgb_to_xyz(chromaticities: Chromaticities) -> Matrix:
 
 
 def to_bt709(matrix: Matrix, neutral: tuple[float, ...]) -> Matrix:
-    """Return the way to linear BT.709 of what `matrix` takes to CIE XYZ.
+    """Return the conversion to linear BT.709 of colours that `matrix` takes to CIE XYZ.
 
     The colour x, y = `neutral` becomes D65, by the Bradford transform.
     """
@@ -59,12 +59,12 @@ def to_bt709(matrix: Matrix, neutral: tuple[float, ...]) -> Matrix:
 
 
 def is_identity(matrix: Matrix) -> bool:
-    """Whether a conversion does nothing, but for rounding in the file."""
+    """Whether a conversion does nothing, except for rounding in the file."""
     return np.allclose(matrix, np.eye(3), rtol=0, atol=SAME_COLOUR)
 
 
 def converted(image: Floats, matrix: Matrix) -> Floats:
-    """Return an image (3, H, W) times a matrix; what overflows is infinite."""
+    """Return a matrix times an image (3, H, W); what overflows is infinite."""
     with np.errstate(over="ignore", invalid="ignore"):
         result: Floats = np.tensordot(matrix.astype(np.float32), image, 1)
     return result

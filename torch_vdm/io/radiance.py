@@ -1,4 +1,4 @@
-"""Radiance's .hdr files: light in four bytes a pixel, three of them above a common exponent."""
+"""Radiance's .hdr files: light in four bytes per pixel, three of them with a common exponent."""
 
 import re
 
@@ -9,10 +9,10 @@ from torch_vdm.io.decoded import Decoded
 from torch_vdm.io.primaries import BT709, XYZ, converted, is_identity, rgb_to_xyz, to_bt709
 from torch_vdm.io.refusal import Floats, ImageError, check_size, require_finite
 
-# "Radiance File Formats" (Ward): the line of the picture's size. The first axis is that of lines.
+# "Radiance File Formats" (Ward): the line with the picture's size. The first axis is that of lines.
 _SIZE = re.compile(rb"([-+][XY]) (\d{1,9}) ([-+][XY]) (\d{1,9})")
 
-# The longest header that is looked at, bytes. Status: choice.
+# The longest header that is read, in bytes. Status: choice.
 LONGEST_HEADER = 2**16
 
 
@@ -21,7 +21,7 @@ def load_hdr(data: bytes, nonfinite: str, notes: list[str]) -> Decoded:
     variables, (axes, lines, length), at = _header(data)
     check_size(length, lines, 4 * length * lines, len(data))
     pixels = _pixels(data, at, lines, length)
-    # An exponent of 128 has no factor but the 256 of the bytes.
+    # With an exponent of 128 the only factor is the 1 / 256 of the bytes.
     factor = np.ldexp(np.float32(1), pixels[..., 3].astype(np.int32) - 136)
     factor[pixels[..., 3] == 0] = 0
     image = np.moveaxis(pixels[..., :3], -1, 0).astype(np.float32) * factor
@@ -65,7 +65,7 @@ def _pixels(data: bytes, at: int, lines: int, length: int) -> NDArray[np.uint8]:
 
 
 def _read_planes(data: bytes, at: int, line: NDArray[np.uint8]) -> int:
-    """A line whose bytes are coded one after another: a run of one byte, or bytes as they are."""
+    """Read a line of channels one after another, each of runs of one byte and literal bytes."""
     length = len(line)
     for channel in range(4):
         filled = bytearray()
@@ -87,7 +87,7 @@ def _read_planes(data: bytes, at: int, line: NDArray[np.uint8]) -> int:
 
 
 def _read_old(data: bytes, at: int, line: NDArray[np.uint8]) -> int:
-    """A line of whole pixels, in which 1, 1, 1, n repeats the pixel before it n times."""
+    """Read a line of whole pixels, in which 1, 1, 1, n repeats the pixel before it n times."""
     place, shift = 0, 0
     length = len(line)
     plain = np.frombuffer(data, np.uint8, min(4 * length, (len(data) - at) // 4 * 4), at)
@@ -113,7 +113,7 @@ def _read_old(data: bytes, at: int, line: NDArray[np.uint8]) -> int:
 
 
 def _upright(image: Floats, axes: bytes) -> Floats:
-    """The image with rows from the top and columns from the left; `axes` as -Y+X says it."""
+    """The image with rows from the top and columns from the left; `axes` is written as in -Y+X."""
     if axes[1:2] == b"X":  # lines are columns
         image = image.swapaxes(1, 2)
     if b"+Y" in axes:
@@ -124,7 +124,7 @@ def _upright(image: Floats, axes: bytes) -> Floats:
 
 
 def _colours(image: Floats, variables: list[tuple[str, str]], notes: list[str]) -> Floats:
-    """Linear BT.709 from what the header says of exposure and primaries."""
+    """Linear BT.709 by the exposure and primaries that the header states."""
     named = dict(variables)
     known = {"32-bit_rle_rgbe": False, "32-bit_rle_xyze": True}
     if named.get("FORMAT", "32-bit_rle_rgbe") not in known:

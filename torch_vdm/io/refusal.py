@@ -1,4 +1,4 @@
-"""What an image is refused for: its size, and values that are no light."""
+"""What an image is refused for: its size, and values that are not light."""
 
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -10,7 +10,7 @@ Floats: TypeAlias = NDArray[np.float32]
 # Limits (choices). Pillow warns above this many pixels, and a metric would need tens of gigabytes.
 MAX_PIXELS = 2**28 // 3
 MAX_SIDE = 2**16 - 1
-# A file may always declare this much; above it, no more than RATIO times its own size, which is
+# A file may always declare this many bytes; above that, at most RATIO times its own size, which is
 # twice what deflate can reach (1032).
 FREE_BYTES = 2**28
 RATIO = 2000
@@ -21,7 +21,7 @@ Negative: TypeAlias = Literal["keep", "raise", "clip"]
 
 
 class Repair(NamedTuple):
-    """What to do about values that are no light; see `torch_vdm.io.load`."""
+    """What to do about values that are not light; see `torch_vdm.io.load`."""
 
     nonfinite: Nonfinite
     negative: Negative
@@ -58,7 +58,7 @@ def check_size(width: int, height: int, decoded: int, size: int) -> None:
 
 
 def first_pixel(bad: NDArray[np.bool_]) -> tuple[int, int]:
-    """x, y of the first pixel, row by row, of which a channel of `bad` (C, H, W) is true."""
+    """x, y of the first pixel, row by row, where a channel of `bad` (C, H, W) is true."""
     y, x = np.unravel_index(int(np.argmax(bad.any(0))), bad.shape[1:])
     return int(x), int(y)
 
@@ -121,7 +121,7 @@ def without_negatives(
 ) -> Floats:
     """Return ``planes`` with negative values kept, refused or replaced by 0.
 
-    Their first pixel is ``origin``, x and y, of the image.
+    Their first pixel is at ``origin``, x and y, in the image.
     """
     if policy == "keep" or planes.min() >= 0:
         return planes

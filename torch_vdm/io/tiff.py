@@ -59,7 +59,7 @@ def load_tiff(data: bytes, repair: Repair, coded: bool, notes: list[str]) -> Dec
     except (ImageError, MemoryError):
         raise
     except Exception as error:
-        # The decoder raises about every class there is when a file is damaged.
+        # The decoder raises almost any class of error when a file is damaged.
         raise ImageError(f"damaged TIFF ({error}); export it again") from error
     turn = turn if isinstance(turn, int) and 1 <= turn <= 8 else 1
     if values.dtype.kind == "f":
@@ -84,7 +84,7 @@ def _only_page(pages: list["TiffPage"]) -> "TiffPage":
 
 
 def _tell_left_out(page: "TiffPage", notes: list[str]) -> None:
-    """Tell of samples that are neither colour nor alpha: an old alpha without its mark, or data."""
+    """Note samples that are neither colour nor alpha: an old alpha without its mark, or data."""
     named = page.samplesperpixel - len(page.extrasamples)
     colours = min(named, 3) if page.photometric == RGB else named
     left = page.samplesperpixel - colours - len(_opacity(page)[:1])
@@ -101,7 +101,7 @@ def _opacity(page: "TiffPage") -> list[int]:
 
 
 def _is_for_pillow(page: "TiffPage") -> bool:
-    """Whether it has what tifffile alone knows nothing of: palettes, bits, most compressions."""
+    """Whether it has what tifffile alone cannot read: palettes, bits, most compressions."""
     if page.bitspersample > 8 or ASSOCIATED in page.extrasamples:
         return False
     plain = page.bitspersample == 8 and page.photometric in (GREY_WHITE_IS_0, GREY, RGB)
@@ -109,7 +109,7 @@ def _is_for_pillow(page: "TiffPage") -> bool:
 
 
 def _check(page: "TiffPage") -> None:
-    """Refuse what would not be read as it is meant."""
+    """Refuse what would not be read as intended."""
     kinds = (FLOAT,) if page.bitspersample > 16 else (UNSIGNED, FLOAT)
     if page.sampleformat not in kinds or page.bitspersample not in (8, 16, 32, 64):
         raise ImageError(

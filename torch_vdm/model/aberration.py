@@ -5,10 +5,11 @@ from torch import Tensor
 
 
 def attenuation(frequency: Tensor, cutoff: Tensor, exponent: Tensor) -> Tensor:
-    """Return the share of each cone's contrast, S, M, L, that the eye's optics let through.
+    """Return the fraction of contrast that the eye's optics pass, for the S, M and L cones.
 
-    exp(-(f / cutoff)^exponent) for S, between 0 and 1: the ratio of the S cones' to the luminance
-    modulation transfer (Section 2, after Marimont and Wandell 1993); 1 for M and L.
+    For S it is exp(-(f / cutoff)^exponent), between 0 and 1: the ratio of the modulation transfer
+    of the S cones to that of luminance (Section 2, after Marimont and Wandell 1993). For M and L
+    it is 1.
     ``frequency`` (levels,) and ``cutoff`` are in cycles/degree; the result is (levels, 3).
     """
     short = torch.exp(-((frequency / cutoff) ** exponent))

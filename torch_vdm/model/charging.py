@@ -1,9 +1,10 @@
 """Which of its pixels a coarse difference is charged to.
 
-A node of a coarse level spans many pixels, and as a rule few of them made the difference that it
-has. Going down the quad-tree, every node takes from what its parent has accumulated the share that
-its own mean differs by, beside the means around it: a coarse detail is made of nothing but these
-means. Where two images are equal the share is exactly 0. Status of the whole file: choice, ours.
+A node of a coarse level spans many pixels, but usually few of them caused its difference. Going
+down the quad-tree, every node inherits a share of what its parent has accumulated, according to
+how much its own mean differs compared with the means around it: a coarse detail consists of these
+means alone. Where two images are equal the share is exactly 0. Status of the whole file: choice,
+ours.
 """
 
 from typing import NamedTuple
@@ -14,45 +15,46 @@ from torch.nn import functional
 
 from torch_vdm.model.quadtree import apart, together
 
-# How many nodes to each side, in the width of one, count as those near by, and as those around:
-# the second is as far as pooling and the lowpass of a parent spread the difference of a parent's
-# neighbour, two of its nodes and so five. Status: derived, for `Haar`.
+# Radii of a node's neighbourhood and of its surroundings, in node widths. The second is as far as
+# pooling and the lowpass of a parent spread the difference of a parent's neighbour: two nodes of
+# the parent's level, and so five of its children's. Status: derived, for `Haar`.
 NEAR, AROUND = 1, 5
 
-# The squared difference of a node's mean over that around it, at which half is left of the base of
-# the inherited share, and the power of that base; a ratio of 1 or more takes all. Noise scatters
-# from node to node, and gratings have zeros: they are to keep what they have, within 3 % of the
-# largest value, and the surroundings of a lamp are to inherit nothing. Status: choice, measured.
+# The ratio of the squared difference of a node's mean to that around it at which the base of the
+# inherited share has fallen to half, and the power of that base. A ratio of 1 or more inherits all.
+# Noise scatters from node to node, and gratings have zeros: these must keep what they have, within
+# 3 % of the largest value, and the surroundings of a lamp must inherit nothing. Status: choice,
+# measured.
 SOFT, POWER = 0.005, 4
 
-# Behind a filter a node differs where its own light does not, for the filter has spread what does.
-# What it has of its own is charged to it where its light differs by this share of the mean around
-# it, and else in proportion. Status: choice, measured.
+# Behind a filter a node may differ although its own light does not, because the filter spreads
+# differences. Its own difference is charged in full where its light's squared difference is at
+# least this fraction of the mean around it, and in proportion below that. Status: choice, measured.
 FAINT = 0.1
 
-# In a cache, planes with more numbers are summed up along one side and the other. Status:
-# choice, measured.
+# When computing in a cache, larger planes, in elements, are summed along one axis, then the other.
+# Status: choice, measured.
 SMALL = 2**10
 
 
 class Charge(NamedTuple):
-    """What a node is charged, (B, 1, h, w), 0 to 1; for differences to the power of 6."""
+    """The shares that a node is charged, (B, 1, h, w), 0 to 1, of differences to the power of 6."""
 
     inherited: Tensor
-    """Of what its parent has accumulated."""
+    """The share of what its parent has accumulated."""
     own: Tensor | None
-    """Of its own local difference; None: all."""
+    """The share of its own local difference; None: all of it."""
 
     def of(self, part: tuple[slice, slice]) -> "Charge":
-        """Return the same of some of the nodes, rows and columns."""
+        """Return the charges of some rows and columns of the nodes."""
         own = None if self.own is None else self.own[..., part[0], part[1]]
         return Charge(self.inherited[..., part[0], part[1]], own)
 
 
 def changes(first: Tensor, second: Tensor) -> Tensor:
-    """Return the squared difference of two lowpass planes (B, 3, h, w), (B, 1, h, w).
+    """Return the squared difference (B, 1, h, w) of two lowpass planes (B, 3, h, w).
 
-    Of light, summed over the cones: that of two equal nodes is exactly 0.
+    It is a difference of light, summed over the cones, and exactly 0 for two equal nodes.
     """
     difference = first - second
     return (difference * difference).sum(1, keepdim=True)
@@ -61,7 +63,7 @@ def changes(first: Tensor, second: Tensor) -> Tensor:
 def charge(
     change: Tensor, shifts: int, filtered: bool, items: int = 1, cached: bool = False
 ) -> Charge:
-    """Return what every node of a level is charged.
+    """Return the shares that every node of a level is charged.
 
     Parameters
     ----------
@@ -70,13 +72,13 @@ def charge(
     shifts
         As `Transform.shifts`.
     filtered
-        Whether what is decomposed was filtered.
+        Whether the decomposed planes were filtered.
     items
-        How many images lie below one another.
+        How many images are stacked vertically.
     cached
         As `Steps.cached`.
     """
-    # Every image by itself.
+    # Each image separately.
     planes = change if items == 1 else apart(change[0, 0], items).unsqueeze(1)
     near, around = (_mean_around(planes, nodes * shifts, cached) for nodes in (NEAR, AROUND))
     ratio = near / around.clamp_min(torch.finfo(around.dtype).tiny)
@@ -88,7 +90,7 @@ def charge(
 
 
 def _mean_around(plane: Tensor, nodes: int, cached: bool) -> Tensor:
-    """Return the mean over so many nodes to each side, the border repeated."""
+    """Return the mean within a radius of ``nodes``, the border repeated."""
     padded = functional.pad(plane, (nodes,) * 4, mode="replicate")
     side = 2 * nodes + 1
     if not cached or plane.numel() <= SMALL:
@@ -97,9 +99,9 @@ def _mean_around(plane: Tensor, nodes: int, cached: bool) -> Tensor:
 
 
 def _sums(plane: Tensor, side: int, dim: int) -> Tensor:
-    """Return the sums of ``side`` successive numbers along a dimension, which it shortens.
+    """Return the sums of ``side`` successive elements along a dimension, which becomes shorter.
 
-    Of sums of 1, 2, 4 ... numbers: few passes, and nothing that cancels.
+    They are built from sums of 1, 2, 4 ... elements: in few passes and without cancellation.
     """
     length = plane.shape[dim] - side + 1
     total, done, width = None, 0, 1

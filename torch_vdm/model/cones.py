@@ -15,9 +15,9 @@ XYZ_TO_SML = (
 
 
 def of_grey(plane: Tensor, grey: Tensor | None) -> Tensor:
-    """Return the cones' planes (B, 3, h, w) of one that stands for them, ``grey`` (3,) times it.
+    """Return the cone planes (B, 3, h, w) that one plane stands for: ``grey`` (3,) times it.
 
-    Without ``grey`` the plane, which then has three channels, as it is.
+    Without ``grey`` the plane has three channels already and is returned as it is.
     """
     return plane if grey is None else plane * grey.view(3, 1, 1)
 

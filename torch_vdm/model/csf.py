@@ -12,7 +12,7 @@ SIZE_TERM, SIZE_FREQUENCY = 12.0, 3.0
 FALL, FALL_LUMINANCE, FALL_EXPONENT = 0.3, 100.0, 0.15
 KNEE = 0.06
 
-# Octaves from the peak are held to this, so that their root has a finite slope. Status: choice.
+# The least distance from the peak in octaves, so that its root has a finite slope. Status: choice.
 SMALLEST_OFFSET = 1e-12
 
 
@@ -36,7 +36,7 @@ def barten(frequency: Tensor, luminance: Tensor, size: Tensor) -> Tensor:
         / (1.0 + SIZE_TERM / (size * (1.0 + frequency / SIZE_FREQUENCY) ** 2))
     )
     b = FALL * (1.0 + FALL_LUMINANCE / luminance) ** FALL_EXPONENT
-    # exp(-b u) sqrt(1 + c exp(b u)), with nothing that overflows in the dark or at high u.
+    # exp(-b u) sqrt(1 + c exp(b u)), written so that nothing overflows in the dark or at high u.
     falling = torch.exp(-0.5 * b * frequency)
     return a * frequency * falling * torch.sqrt(falling * falling + KNEE)
 
@@ -44,9 +44,9 @@ def barten(frequency: Tensor, luminance: Tensor, size: Tensor) -> Tensor:
 def bandpass(octaves: Tensor, width: Tensor, floor: Tensor) -> Tensor:
     """Return a sensitivity relative to its peak, between 0 and 1, ``octaves`` above the peak.
 
-    exp(-(octaves / width)^1.5) over the peak; below it the same curve down to ``floor``, for
-    sensitivity levels off at low frequency. The exponent is a choice: an exponential is too
-    pointed, a parabola falls too fast.
+    Above the peak it is exp(-(octaves / width)^1.5). Below, the same curve falls only to ``floor``,
+    because sensitivity levels off at low frequency. The exponent is a choice: an exponential is
+    too pointed, a parabola falls too fast.
     """
     offset = octaves.abs().clamp_min(SMALLEST_OFFSET) / width
     falling = torch.exp(-offset * torch.sqrt(offset))
@@ -56,7 +56,7 @@ def bandpass(octaves: Tensor, width: Tensor, floor: Tensor) -> Tensor:
 def butterworth(frequency: Tensor, gain: Tensor, cutoff: Tensor, order: Tensor) -> Tensor:
     """Return a chromatic contrast sensitivity, gain / sqrt(1 + (f / cutoff)^(2 order)).
 
-    Lowpass, as the chromatic sensitivities of Mullen 1985 are; ``frequency`` and ``cutoff`` in
-    cycles/degree.
+    It is lowpass, like the chromatic sensitivities of Mullen 1985; ``frequency`` and ``cutoff``
+    are in cycles/degree.
     """
     return gain / torch.sqrt(1.0 + (frequency / cutoff) ** (2.0 * order))

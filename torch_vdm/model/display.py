@@ -28,8 +28,8 @@ SRGB_TOE = 0.0031308
 # What `Display.to_code` takes as white where the image is absolute XYZ, in cd/m2. Status: choice.
 XYZ_WHITE = 100.0
 
-# Light beyond this, in cd/m2, is held to it: the sun's disc has about 1.6e9 cd/m2, and the sum of
-# four pixels must stay finite in float32. Status: choice.
+# Light is clamped to this, in cd/m2: the sun's disc has about 1.6e9 cd/m2, and the sum of four
+# pixels must stay finite in float32. Status: choice.
 BRIGHTEST = 1e12
 # The same for sRGB-coded values, whose nominal range is [0, 1]. Status: choice.
 LARGEST_CODE = 1e4
@@ -46,7 +46,7 @@ class Display:
     white
         Luminance of the pixel value (1, 1, 1), in cd/m2; 1 for XYZ, which is absolute.
     exposure
-        Stops; the light is multiplied by 2^exposure.
+        In stops; the light is multiplied by 2^exposure.
     """
 
     encoding: Encoding
@@ -54,7 +54,7 @@ class Display:
     exposure: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what is no display."""
+        """Refuse invalid options."""
         choice("an encoding", self.encoding, get_args(Encoding))
         for name in ("white", "exposure"):
             object.__setattr__(self, name, number(name, getattr(self, name)))
@@ -74,7 +74,7 @@ class Display:
     def srgb(cls, peak: float = 100.0, exposure: float = 0.0) -> Self:
         """Return a display of sRGB-coded values in [0, 1] whose white has ``peak`` cd/m2.
 
-        Values slightly outside [0, 1] are legal: the linear part of the curve goes on below 0
+        Values slightly outside [0, 1] are legal: the linear part of the curve continues below 0
         and the power above 1.
         """
         return cls("srgb", peak, exposure)
@@ -102,7 +102,7 @@ class Display:
         image
             (B, 3, H, W).
         primaries
-            (3, 3), `BT709_TO_XYZ`; not used for an image that is XYZ.
+            (3, 3), `BT709_TO_XYZ`; not used for an XYZ image.
 
         Returns
         -------
@@ -110,22 +110,22 @@ class Display:
             (B, 3, H, W), within +-1e12 cd/m2.
         """
         values = linear_values(image, self.encoding, self.limit(image))
-        # The gain goes into nine numbers instead of every pixel.
+        # The gain multiplies nine matrix entries instead of every pixel.
         return values if self.encoding == "xyz" else mix(primaries * self.gain, values)
 
     def limit(self, image: Tensor) -> Tensor | None:
-        """Return what linear values are held to, like ``image``; None where no code passes it."""
+        """Return the limit of linear values, like ``image``; None if no code can exceed it."""
         limit = BRIGHTEST / self.gain
         if self.encoding == "srgb" and limit >= LARGEST_CODE**SRGB_EXPONENT:
             return None
         return image.new_full((), limit)
 
     def to_code(self, image: Tensor) -> Tensor:
-        """Return sRGB-coded values: those of an sRGB display, or of light over white.
+        """Return sRGB-coded values: those of an sRGB display, or of light relative to white.
 
-        For XYZ, which has no white, light over 100 cd/m2. Over 1 the curve's power goes on, below
-        0 its linear part. (B, 3, H, W) to the same shape, for a loss: 0.01 is about as visible
-        on black as on white.
+        XYZ has no white, so its light is taken relative to 100 cd/m2. The curve's power continues
+        above 1, its linear part below 0. The shape is (B, 3, H, W), as before. This serves a loss:
+        0.01 is about as visible on black as on white.
         """
         if self.encoding == "srgb":
             return image.clamp(-LARGEST_CODE, LARGEST_CODE)
@@ -142,22 +142,22 @@ def linear_values(image: Tensor, encoding: str, limit: Tensor | None) -> Tensor:
 
 
 def encode_srgb(light: Tensor) -> Tensor:
-    """Return the sRGB-coded values of linear ones (IEC 61966-2-1), 1.0 to 1.0, not clipped."""
-    # The power never sees a base whose gradient is not finite.
+    """Return the sRGB codes of linear values (IEC 61966-2-1), unclipped; 1.0 maps to 1.0."""
+    # The base of the power is clamped so that its gradient is finite.
     power = (1.0 + SRGB_OFFSET) * light.clamp_min(SRGB_TOE) ** (1.0 / SRGB_EXPONENT) - SRGB_OFFSET
     return torch.where(light <= SRGB_TOE, SRGB_SLOPE * light, power)
 
 
 def decode_srgb(image: Tensor) -> Tensor:
-    """Return the linear values of sRGB-coded ones (IEC 61966-2-1), 1.0 to 1.0."""
-    # The power never sees a base whose gradient is not finite. It is written in base 2, which is
-    # the processor's own: twice as fast, and as exact. Both parts take the image itself, which a
-    # backward pass has anyway.
+    """Return the linear values of sRGB codes (IEC 61966-2-1); 1.0 maps to 1.0."""
+    # The base of the power is clamped so that its gradient is finite. The power is written in base
+    # 2, the processor's native one: twice as fast, and as exact. Both parts start from the image
+    # itself, which a backward pass keeps anyway.
     base = image.clamp(SRGB_KNEE, LARGEST_CODE)
     straight = image.clamp_min(-LARGEST_CODE)
     scale = 1.0 / (1.0 + SRGB_OFFSET)
     if not (torch.is_grad_enabled() and image.requires_grad):
-        # The same in place: what a backward pass would need is overwritten.
+        # The same in place, overwriting what a backward pass would need.
         power = base.add_(SRGB_OFFSET).mul_(scale).log2_().mul_(SRGB_EXPONENT).exp2_()
         return torch.where(image <= SRGB_KNEE, straight.mul_(1.0 / SRGB_SLOPE), power)
     power = torch.exp2(SRGB_EXPONENT * torch.log2((base + SRGB_OFFSET) * scale))
@@ -177,12 +177,12 @@ def pixels_per_degree(
     diagonal_inches
         Diagonal of the screen in inches.
     distance_metres
-        From the eye to the screen's centre, in metres.
+        Distance from the eye to the screen's centre in metres.
 
     Raises
     ------
     ValueError
-        Where a number is not positive and finite.
+        If a number is not positive and finite.
     """
     if not (isinstance(resolution, Sequence) and len(resolution) == 2):
         raise ValueError(f"expected a resolution (width, height), got {resolution!r}")

@@ -11,11 +11,11 @@ from torch_vdm.model.charging import Charge
 from torch_vdm.model.grid import NONE, Before
 from torch_vdm.model.quadtree import push
 
-# A difference over this is visible, in JND: the unit's definition.
+# A difference above this, in JND, is visible: the unit's definition.
 VISIBLE = 1.0
 
-# A difference counts for no more, in JND, so that its power of 6 stays finite in float32. Light has
-# no such differences; values below 0 may. Status: choice.
+# Differences are clamped to this, in JND, so that their 6th power stays finite in float32. Light
+# has no such differences, but values below 0 may. Status: choice.
 LARGEST_DIFFERENCE = 1e5
 
 # Below this the power of a difference is 0 in float32. Status: choice.
@@ -31,7 +31,7 @@ def local_visual_difference(difference: Tensor, exponent: Tensor) -> Tensor:
     Parameters
     ----------
     difference
-        (B, channels, orientations, h, w): what is left of the two images' pooled responses.
+        (B, channels, orientations, h, w): that of the two images' pooled responses.
     exponent
         2.4 in the paper.
 
@@ -41,8 +41,8 @@ def local_visual_difference(difference: Tensor, exponent: Tensor) -> Tensor:
         (B, 1, h, w), in JND to the power of ``exponent``.
     """
     size = difference.abs()
-    # size^exponent, as a square times what is left, in the processor's own base 2: faster than a
-    # power, exactly 0 at 0, and with finite derivatives there.
+    # size^exponent as a square times the remaining power, in the processor's native base 2: faster
+    # than a power, exactly 0 at 0, and with finite derivatives there.
     rest = torch.exp2((exponent - 2.0) * torch.log2(size.clamp_min(SMALLEST_DIFFERENCE)))
     return (size * size * rest).sum((1, 2)).unsqueeze(1)
 
@@ -52,11 +52,12 @@ def local_visual_difference_of_energy(
 ) -> Tensor:
     """Return the local visual difference of squared differences: their power of exponent / 2.
 
-    Arguments as `local_visual_difference`, whose square is the ``energy`` times 2^``left``.
+    Arguments are as in `local_visual_difference`, but the squared difference is the ``energy``
+    times 2^``left``.
     """
     octaves = torch.log2(energy.clamp_min(SMALLEST_DIFFERENCE))
     held = (octaves + left).clamp_max(2.0 * math.log2(LARGEST_DIFFERENCE))
-    # The energy times what is left of its power: exactly 0 at 0.
+    # The energy times its remaining power: exactly 0 at 0.
     power = energy * torch.exp2(0.5 * exponent * held - octaves)
     return power.sum((1, 2)).unsqueeze(1)
 
@@ -64,7 +65,7 @@ def local_visual_difference_of_energy(
 def cubes(ratio: Tensor, factor: Tensor | float) -> Tensor:
     """Return the same for an exponent of 6, of squared differences ``ratio`` times ``factor``.
 
-    Two multiplications are their power.
+    The power is then two multiplications.
     """
     squared = (ratio * factor).clamp_max(LARGEST_DIFFERENCE**2)
     return (squared * squared * squared).sum((1, 2)).unsqueeze(1)
@@ -74,11 +75,11 @@ class Paths(NamedTuple):
     """What accumulates down the paths of the quad-tree."""
 
     local: tuple[Tensor, ...]
-    """One (B, 1, h, w) a level, level 0 (the root) first: what `accumulate` takes."""
+    """One (B, 1, h, w) per level, level 0 (the root) first: what `accumulate` takes."""
     changes: tuple[Tensor, ...]
-    """The same shapes: how far the means of nodes differ, `charging.changes`; or none."""
+    """The same shapes: how far the means of nodes differ, see `charging.changes`; or empty."""
     root: Tensor
-    """(B, 1, 1, 1), what every path begins with."""
+    """(B, 1, 1, 1), the value that every path starts from."""
 
 
 def accumulate(
@@ -93,20 +94,20 @@ def accumulate(
     Parameters
     ----------
     local
-        One (B, 1, h, w) a level, level 0 (the root) first; none for an image of one pixel.
+        One (B, 1, h, w) per level, level 0 (the root) first; none for an image of one pixel.
     root
-        (B, 1, 1, 1), what every path begins with: the lowpass term, or 0.
+        (B, 1, 1, 1), the value that every path starts from: the lowpass term, or 0.
     items
-        How many trees lie below one another, root (1, 1, items, 1) and all.
+        How many trees are stacked vertically; the root is then (1, 1, items, 1).
     before
-        For each level what is put before its first node; nothing by default.
+        For each level, how many nodes are put before its first; none by default.
     charges
-        One a level: what a node is charged. None: every child all that its parent has, as printed.
+        One per level: what its nodes are charged. None: all that their parent has, as printed.
 
     Returns
     -------
     Tensor
-        (B, 1, h, w) of the finest level, in JND to the power of the summation.
+        (B, 1, h, w) of the finest level, in JND to the power of the summation exponent.
     """
     total = root
     for level, (nodes, first) in enumerate(zip(local, before or [NONE] * len(local), strict=True)):
@@ -122,8 +123,8 @@ def accumulate(
 def just_noticeable(total: Tensor, exponent: Tensor) -> Tensor:
     """Return the root of accumulated differences, in JND.
 
-    Its slope at 0, which is infinite, is given as 0: together with the power's own slope, which
-    is 0 there, the derivative by an image is finite everywhere.
+    Its infinite slope at 0 is replaced by 0. The slope of the power is 0 there as well, so the
+    derivative with respect to an image is finite everywhere.
     """
     differs = total > 0.0
     return torch.where(differs, torch.where(differs, total, 1.0) ** (1.0 / exponent), 0.0)

@@ -1,8 +1,9 @@
 """Contrast sensitivity before the decomposition: an image as weighted contrast.
 
-The boxes of Fig. 2 from chromatic aberration to contrast sensitivity, on the smooth bands of
-`torch_vdm.model.cortex.bands`, each in its own lowpass and luminance, and all bands together again.
-For transforms with ``csf="filter"``, whose levels then only divide by their gains.
+The boxes of Fig. 2 from chromatic aberration to contrast sensitivity are applied to the smooth
+bands of `torch_vdm.model.cortex.bands`, each relative to its own lowpass and luminance, and the
+bands are summed again. Transforms with ``csf="filter"`` use this; their levels then only divide by
+their gains.
 """
 
 import itertools
@@ -20,20 +21,20 @@ from torch_vdm.model.level import Level, adapted_luminance, sensitivity_at
 from torch_vdm.model.matrix import mix_row
 from torch_vdm.model.steps import PLAIN, Steps
 
-# Where the weights of the bands are worked out, log2 cd/m2, and between them interpolated:
-# sensitivities change by less than 3 dB from one to the next. Status: choice.
+# Luminances, in log2 cd/m2, at which the band weights are computed; they are interpolated between
+# them. Sensitivities change by less than 3 dB from one to the next. Status: choice.
 LUMINANCES = tuple(range(-8, 18))
 
 
 class Weights(NamedTuple):
-    """What weights the bands of an image, the finest first."""
+    """The weights of the bands of an image, the finest first."""
 
     passed: Tensor
-    """(bands, 3): the share of each cone's details that chromatic aberration leaves."""
+    """(bands, 3): the fraction of each cone's details that chromatic aberration passes."""
     weights: Tensor
-    """(channels, bands): so that the contrast sensitivity passes at the bands' frequencies."""
+    """(channels, bands): with these the response at the bands' frequencies is the sensitivity."""
     at_luminances: Tensor | None
-    """(bands + 1, luminances): where the luminance is local, what A's weights are multiplied by at
+    """(bands + 1, luminances), where the luminance is local: the factors of A's weights at
     `LUMINANCES`, band by band, and in the last row those of C1 and C2."""
 
 
@@ -45,22 +46,22 @@ def weights(
     Parameters
     ----------
     constants
-        The observer's numbers, and ``band_frequencies`` and ``band_weights``.
+        The observer's parameters, ``band_frequencies`` and ``band_weights``.
     passed
-        (bands, 3).
+        (bands, 3), as in `Weights`.
     bright
-        (channels, bands): the contrast sensitivity at the bands' frequencies of all channels, or of
-        C1 and C2 in bright light where it is ``local``, in the local luminance.
+        (channels, bands): the contrast sensitivity of all channels at the bands' frequencies; if
+        ``local``, that of C1 and C2 in bright light.
     local, chromatic
-        Of the observer, and of what is simulated.
+        Whether sensitivity follows the local luminance, and whether C1 and C2 are simulated.
     """
     frequency = constants["band_frequencies"]
     ones = torch.ones_like(frequency)
-    # No matrix products, which autocast would round.
+    # No matrix products: autocast would round them.
     weighting = (constants["band_weights"] * bright.unsqueeze(1)).sum(2)
     if not local:
         return Weights(passed, weighting, None)
-    # Of the light alone: the eye's own is added to it again.
+    # Of the light alone: the eye's own light is added again later.
     luminances = torch.exp2(ones.new_tensor(LUMINANCES)) - constants["dark_light"]
     grey = luminances * constants["cones"].sum(1, keepdim=True)
     at_bands = (part[..., None, None] for part in (ones, frequency, ones, bright))
@@ -85,9 +86,9 @@ def weighted_contrast(
 ) -> Tensor:
     """Return the weighted contrast of A, C1, C2, 1 at threshold: (B, channels, H, W).
 
-    Of cone planes (B, 3, H, W), from the scale ``finest`` on, to the coarsest or to that where
-    ``coarser`` is the sum of the rest. ``grey``, (3,): of one plane (B, 1, H, W), and the cones'
-    are so many times it.
+    ``planes`` are cone planes (B, 3, H, W). The scales go from ``finest`` to the coarsest, or to
+    the one at which ``coarser`` is the sum of the rest. With ``grey`` (3,) there is one plane
+    (B, 1, H, W), and the cone planes are ``grey`` times it.
     """
     eye = constants["dark_cones"], constants["opponents"]
     of_light = {name: constants[name] for name in ("luminance_of_cones", "dark_light")}
@@ -127,7 +128,7 @@ def _of_scale(
     grey: Tensor | None,
     steps: Steps,
 ) -> tuple[Tensor, Tensor]:
-    """Return the weighted contrast of a scale's bands, and the lowpass that it leaves."""
+    """Return the weighted contrast of a scale's bands, and the lowpass that remains."""
     planes, around, lowpass = bands.parted(plane, finest, steps)
     passed, weights_of_bands, table = weighting
     at_places = None
@@ -142,14 +143,14 @@ def _of_scale(
 def band_sensitivity(lowpass: Tensor, table: Tensor, of_light: Mapping[str, Tensor]) -> Tensor:
     """Return the rows of a table at the local luminance, (B, rows, h, w).
 
-    ``lowpass`` is (B, 3, h, w); ``table`` is at `LUMINANCES`, and between them linear.
+    ``lowpass`` is (B, 3, h, w); ``table`` is given at `LUMINANCES`, and linear between them.
     """
     seen = adapted_luminance(lowpass, of_light)
     last = len(LUMINANCES) - 1
     place = (torch.log2(seen[:, 0]) - LUMINANCES[0]).clamp(0.0, last)
     low = place.detach().floor().clamp_max(last - 1.0)
     index, rest = low.long(), place - low
-    # Selected from columns, and not by an index of any shape, which takes four times as long.
+    # Columns are selected: indexing with a tensor of any shape takes four times as long.
     before, after = (
         table.index_select(1, column.flatten()).unflatten(1, place.shape)
         for column in (index, index + 1)
@@ -169,10 +170,10 @@ def band_contrast(
 ) -> Tensor:
     """Return the weighted contrast (B, channels, h, w) of the n bands (B, 3, h, w) of a scale.
 
-    ``around`` (B, 3, h, w) is what the eye is adapted to, ``passed`` (n, 3) what chromatic
-    aberration leaves, ``weights_of_bands`` (channels, n), ``at_places`` (B, n + 1, h, w) what
-    multiplies those of A, and of C1 and C2, where they are local. ``grey`` as in
-    `weighted_contrast`.
+    ``around`` (B, 3, h, w) is what the eye is adapted to, ``passed`` (n, 3) the fraction that
+    chromatic aberration passes, and ``weights_of_bands`` is (channels, n). Where the weights are
+    local, ``at_places`` (B, n + 1, h, w) multiplies those of A and, with its last row, those of C1
+    and C2. ``grey`` is as in `weighted_contrast`.
     """
     adaptation = 1.0 / adapted(of_grey(around, grey), dark_cones)
     of_one = of_grey(adaptation, grey).unbind(1)
@@ -184,7 +185,7 @@ def band_contrast(
             channels = [mix_row(row, contrast) for row in mixing]
         else:
             channels = [mix_row(row, of_one) * band[:, 0] for row in mixing]
-        if at_places is not None:  # A's by themselves, for they follow the luminance band by band
+        if at_places is not None:  # A's separately: they follow the luminance band by band
             channels[0] = channels[0] * at_places[:, number]
         seen = [a + b for a, b in zip(seen, channels, strict=True)] if seen else channels
     if at_places is not None:

@@ -1,21 +1,22 @@
-"""Where the nodes of a quad-tree lie on an image: which pixels are below each.
+"""Where the nodes of a quad-tree lie on an image: which pixels each covers.
 
 The paper's nodes begin at the image's corner, so that an edge on a multiple of 2^k coincides with a
-border of nodes at k levels, where no wavelet sees it. Nodes may begin before the corner instead: at
-some levels one node is put before the first row and column, as an odd side gets one after the last.
+border of nodes at k levels, where no wavelet responds to it. Nodes may begin before the corner
+instead: at some levels one node is put before the first row and column, just as an odd side gets
+one after the last.
 """
 
 from typing import NamedTuple
 
-# At a level, in y and in x: how many nodes are put before the first, 0 or 1. The node i of a side
-# has the parent (i + before) // 2.
+# How many nodes are put before the first at a level, in y and in x: 0 or 1. The parent of node i
+# along a side is (i + before) // 2.
 Before = tuple[int, int]
 
 NONE: Before = (0, 0)
 
-# Octaves, from the pixels up, that begin at the corner. Shifted too, they leave the last row of
-# pixels alone in a node and in its parent, and the eye adapted to that row, black as it may be.
-# Status: choice.
+# How many octaves, from the pixels up, begin at the corner. If these were shifted too, the last
+# row of pixels would be alone in a node and in its parent, and the eye would adapt to that row
+# even if it is black. Status: choice.
 UNSHIFTED = 2
 
 
@@ -25,35 +26,35 @@ class Side(NamedTuple):
     before: int
     """How many nodes are put before the first, 0 or 1."""
     first: float
-    """The share of its pixels that the first node has."""
+    """The fraction of its pixels that the first node has."""
     last: float
-    """The same of the last node. The only node of a side is both, and has all that there are."""
+    """The same for the last node. The only node of a side is both, and has all pixels there are."""
 
 
 class Grid(NamedTuple):
-    """What is put before the first nodes, from the pixels up; nothing from there on.
+    """How many nodes are put before the first, from the pixels up; none at coarser levels.
 
     The default is the paper's grid.
     """
 
     rows: tuple[int, ...] = ()
-    """For each level 0 or 1."""
+    """0 or 1 for each level."""
     columns: tuple[int, ...] = ()
 
     def before(self, octave: int) -> Before:
-        """Return what is put before the first of the nodes of 2^octave pixels."""
+        """Return how many nodes are put before the first of those of 2^octave pixels."""
         rows, columns = (steps[octave : octave + 1] for steps in self)
         return sum(rows), sum(columns)
 
     def down(self, levels: int, finest: int = 0) -> tuple[Before, ...]:
-        """Return the same for levels of nodes, the coarsest first.
+        """Return the same for so many levels of nodes, the coarsest first.
 
         The finest of them has nodes of 2^(finest + 1) pixels.
         """
         return tuple(self.before(finest + levels - level) for level in range(levels))
 
     def offset(self, octave: int) -> tuple[int, int]:
-        """Return how many pixels before the image's the first node of 2^octave pixels begins."""
+        """Return how many pixels before the image the first node of 2^octave pixels begins."""
         rows, columns = (
             sum(step << finer for finer, step in enumerate(steps[:octave])) for steps in self
         )
@@ -73,8 +74,8 @@ class Grid(NamedTuple):
     def part(self, corner: tuple[int, int], octaves: int) -> "Grid":
         """Return the grid of a part of the image whose first pixel is ``corner``, y and x.
 
-        Of its ``octaves`` finest levels. The part begins at the image's border, or where a node of
-        the level above these does and so one of each.
+        It has the ``octaves`` finest levels. The part begins at the image's border, or where a node
+        of the level above these begins, and so a node of each of them.
         """
         rows, columns = (
             steps[:octaves] if begin == 0 else () for steps, begin in zip(self, corner, strict=True)
@@ -87,11 +88,11 @@ PAPERS = Grid()
 
 
 def thirds(size: tuple[int, int]) -> Grid:
-    """Return the grid whose nodes begin a third of a node, or two, before the image's corner.
+    """Return the grid whose nodes begin one or two thirds of a node before the image's corner.
 
-    From `UNSHIFTED` on, at every second level, one node is put before the first: then the nodes of
-    2^k pixels begin (...010100) pixels before the corner, a binary number of k digits. Not where
-    two nodes are left, which are the children of the last one.
+    From `UNSHIFTED` on, one node is put before the first at every second level: the nodes of 2^k
+    pixels then begin (...010100) pixels before the corner, a binary number of k digits. Where only
+    two nodes are left, the children of the root, none is put before them.
     """
     rows, columns = map(_thirds, size)
     return Grid(rows, columns)

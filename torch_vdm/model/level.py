@@ -1,11 +1,11 @@
 """One level of two images, from details to their local visual difference: Fig. 2 from box 3 on.
 
 Chromatic aberration and adaptation, local contrast, opponents contrast space and contrast
-sensitivity are of one image; masking and spatial pooling of two, in the order of the observer:
+sensitivity act on one image; masking and spatial pooling act on two, in the observer's order:
 
-- the paper's takes the difference of two transducers' outputs, and pools it;
+- the paper's takes the difference of the two transducer outputs, and pools it;
 - the calibrated one pools the squared difference of weighted contrasts, which keep their sign, and
-  what masks it, and masks what is pooled.
+  pools the energy that masks it, then masks the pooled difference.
 """
 
 import math
@@ -40,7 +40,7 @@ from torch_vdm.model.pooling import (
 from torch_vdm.model.quadtree import push
 from torch_vdm.model.steps import PLAIN, Steps
 
-# The constants that the sensitivity in the local luminance depends on.
+# The constants that the sensitivity at the local luminance depends on.
 OF_LUMINANCE = (
     "luminance_of_cones",
     "dark_light",
@@ -61,46 +61,45 @@ OF_LUMINANCE = (
 class Level(NamedTuple):
     """What a level of the transform responds to, as far as it does not depend on the image.
 
-    For planes (h, w) of one level the last two sides are 1 and 1; for the nodes of several levels
-    in a row, they are 1 and as many. Where there are as many as orientations, one stands for all
-    where all have the same.
+    For planes (h, w) of one level the last two dimensions are 1 and 1; for the nodes of several
+    levels in a row they are 1 and the number of nodes. The dimension of the orientations is 1
+    where all of them have the same value.
     """
 
     passed: Tensor
-    """(3, 1, 1): the share of each cone's details that chromatic aberration leaves."""
+    """(3, 1, 1): the fraction of each cone's details that chromatic aberration passes."""
     frequency: Tensor
-    """(as many, 1, 1), in cycles/degree: the frequency of the best response."""
+    """(orientations, 1, 1), in cycles/degree: the frequency of the best response."""
     gain: Tensor
-    """(as many, 1, 1): what contrast is divided by."""
+    """(orientations, 1, 1): what contrast is divided by."""
     sensitivity: Tensor
-    """(channels, as many, 1, 1): the contrast sensitivity, over the gain. Where the luminance is
-    local, that of C1 and C2 in bright light."""
+    """(channels, orientations, 1, 1): the contrast sensitivity, divided by the gain. Where the
+    luminance is local, that of C1 and C2 in bright light."""
 
 
 class Levels(NamedTuple):
-    """The same of all levels of an image, level 0 first, without the last two sides."""
+    """The same for all levels of an image, level 0 first, without the last two dimensions."""
 
     passed: Tensor
     """(levels, 3)."""
     frequency: Tensor
-    """(levels, as many)."""
+    """(levels, orientations)."""
     gain: Tensor
-    """(levels, as many)."""
+    """(levels, orientations)."""
     sensitivity: Tensor
-    """(levels, channels, as many)."""
+    """(levels, channels, orientations)."""
 
     def only(self, number: int) -> Level:
         """Return one level."""
-        # Copies, for compiled code is specialised on views and their offsets.
+        # Copies: compiled code is specialised on views and their offsets.
         return Level(*(part[number, ..., None, None].clone() for part in self))
 
     def in_a_row(self, nodes: Sequence[int]) -> Level:
         """Return the coarsest levels as one, whose plane is the ``nodes`` of each in a row."""
-        # For each node its level; the size is given so that nothing is read back from the device.
+        # The level of each node; the size is given so that nothing is read back from the device.
         counts = torch.tensor(nodes, device=self.passed.device)
         which = torch.repeat_interleave(counts, output_size=sum(nodes))
-        # Of planes of two dimensions a selection is much faster than of those of three. Copies, as
-        # in `only`.
+        # Selecting from two dimensions is much faster than from three. Copies, as in `only`.
         return Level(
             *(
                 part.flatten(1)
@@ -115,32 +114,32 @@ class Levels(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """What turns the details of an image at a level into contrasts and weights them."""
+    """The channel weighting: it turns an image's details at a level into weighted contrasts."""
 
     scale: Tensor | None
-    """(B, 3, h, w): for each cone the share that chromatic aberration leaves, over what the
-    parent is adapted to. None where the details are weighted contrast already, or those of one
-    plane, whose contrast in each channel the sensitivity has."""
+    """(B, 3, h, w): for each cone, the fraction that chromatic aberration passes, divided by what
+    the parent is adapted to. None where the details are weighted contrast already, or those of one
+    plane, for which the sensitivity includes the contrast of each channel."""
     sensitivity: Tensor
-    """(B, channels, orientations, h, w): the contrast sensitivity of each channel, or one
-    orientation or node of it where all have the same."""
+    """(B, channels, orientations, h, w): the contrast sensitivity of each channel; a single
+    orientation or node where all have the same."""
 
     def pushed(self, size: tuple[int, int], items: int = 1, before: Before = NONE) -> "Sight":
-        """Return what is given at the parents at their children, as `push` takes them."""
+        """Return the weighting given at the parents for their children; arguments as in `push`."""
         shared = self.sensitivity.shape[-2:] == (1, 1)
         children = size, items, before
         sensitivity = self.sensitivity if shared else push(self.sensitivity, *children)
         return Sight(None if self.scale is None else push(self.scale, *children), sensitivity)
 
     def of(self, orientations: slice) -> "Sight":
-        """Return the sight of some orientations."""
+        """Return the channel weighting of some orientations."""
         if self.sensitivity.shape[2] == 1:
             return self
         return Sight(self.scale, self.sensitivity[:, :, orientations])
 
 
 class Options(NamedTuple):
-    """What the boxes of a level depend on beside details and sights."""
+    """What the boxes of a level depend on besides details and channel weightings."""
 
     signed: bool
     """As `Observer.signed`."""
@@ -149,11 +148,11 @@ class Options(NamedTuple):
     phases: int
     """As `Transform.phases`."""
     overlapping: bool
-    """Whether nodes overlap, `Transform.shifts` of them in the width of one."""
+    """Whether nodes overlap, `Transform.shifts` of them per node width."""
     pooled: int
     """How many nodes in a row are pooled: 3, or 1."""
     cubes: bool
-    """Whether the exponent of the summation is 6, and so that of energies 3."""
+    """Whether the summation exponent is 6, which makes that of energies 3."""
     matrix: Tensor
     """(channels, 3), of Eq. 3."""
     transducer_exponent: Tensor
@@ -163,8 +162,8 @@ class Options(NamedTuple):
     def energies(self) -> bool:
         """Whether squares are pooled.
 
-        Neighbours with signs would cancel; and of overlapping nodes and of quadrature pairs the
-        energy hardly depends on the phase of a grating.
+        Signed neighbours would cancel; and the energy of overlapping nodes and of quadrature
+        pairs hardly depends on the phase of a grating.
         """
         return self.signed or self.overlapping
 
@@ -178,16 +177,17 @@ def local_difference(
     steps: Steps = PLAIN,
     items: int = 1,
 ) -> Tensor:
-    """Return the local visual difference (B, 1, h, w) of a level of two images.
+    """Return the local visual difference (B, 1, h, w) of two images at a level.
 
-    ``details`` and ``others`` are (B, 3, orientations, h, w); sights at the nodes themselves.
+    ``details`` and ``others`` are (B, 3, orientations, h, w); the channel weightings are those at
+    the nodes themselves.
     """
     difference = steps(response_difference, details, others, sight, other_sight, options)
     return gathered(difference, options, steps, items)
 
 
 def gathered(difference: Tensor, options: Options, steps: Steps = PLAIN, items: int = 1) -> Tensor:
-    """Return the local visual difference (B, 1, h, w) of `difference_of` two images."""
+    """Return the local visual difference (B, 1, h, w) from the `difference_of` two images."""
     around = surrounded(difference, options, steps, items)
     return within(steps(pooled_difference, around, options), difference.shape[-2], items)
 
@@ -195,7 +195,7 @@ def gathered(difference: Tensor, options: Options, steps: Steps = PLAIN, items: 
 def surrounded(
     difference: Tensor, options: Options, steps: Steps = PLAIN, items: int = 1
 ) -> Tensor:
-    """Return `difference_of` two images with the neighbours that `pooled_difference` takes."""
+    """Return the `difference_of` two images with the neighbours that `pooled_difference` needs."""
     if options.overlapping:
         rows: Tensor = steps(
             pool_halves, surround_halves(difference, options.pooled), options.pooled, -1
@@ -205,14 +205,14 @@ def surrounded(
 
 
 def pooled_difference(around: Tensor, options: Options) -> Tensor:
-    """Return the local visual difference of what `surrounded` gives.
+    """Return the local visual difference from what `surrounded` gives.
 
-    Printed responses are pooled as a difference, for pooling is linear; others come as squares.
+    The paper's responses are pooled as a difference, because pooling is linear; others as squares.
     """
     if not options.energies:
         pooled = pool(around) if options.pooled > 1 else around
         return local_visual_difference(pooled, options.summation_exponent)
-    # Sums, which are divided where it costs least.
+    # Sums; they are divided where that costs least.
     if options.overlapping:
         pooled, count = pool_halves(around, options.pooled, -2), covering(options.pooled)
     elif options.pooled > 1:
@@ -224,8 +224,9 @@ def pooled_difference(around: Tensor, options: Options) -> Tensor:
     if options.cubes:
         if masks is None:
             return cubes(pooled, 1.0 / count)
-        # What masks is no less than half of what differs: no slope of their ratio overflows, nor of
-        # what is left, where values below 0 make differences that light has not.
+        # The masking energy is at least half of the energy that differs: no slope of their ratio or
+        # of the remaining factor overflows, even where values below 0 give differences that light
+        # never has.
         base = masks + 1.0
         octaves = unmasked(masks, options.transducer_exponent) + torch.log2(base)
         return cubes(pooled / base, torch.exp2(octaves - math.log2(count)))
@@ -236,9 +237,9 @@ def pooled_difference(around: Tensor, options: Options) -> Tensor:
 
 
 def response(details: Tensor, sight: Sight, options: Options) -> Tensor:
-    """Return the responses of one level of one image: local contrast to the transducer.
+    """Return the responses of one image at a level, from local contrast to the transducer.
 
-    Signed ones are weighted contrast: what masks their difference is of both images.
+    Signed responses are weighted contrast: the masking of their difference involves both images.
     """
     contrast = details
     if sight.scale is not None:
@@ -250,10 +251,10 @@ def response(details: Tensor, sight: Sight, options: Options) -> Tensor:
 
 
 def difference_of(one: Tensor, other: Tensor, options: Options) -> Tensor:
-    """Return what is pooled of two images' responses at a level, (B, channels, n, h, w).
+    """Return what is pooled from two images' responses at a level, (B, channels, n, h, w).
 
-    Their differences, or the energy of these, one for all phases of an orientation. Where signed
-    ones are masked, what masks them is the last of the n.
+    These are their differences, or the energy of the differences, one for all phases of an
+    orientation. Where signed responses are masked, the masking energy is the last of the n.
     """
     difference = one - other
     if not options.energies:
@@ -267,10 +268,10 @@ def difference_of(one: Tensor, other: Tensor, options: Options) -> Tensor:
 def response_difference(
     details: Tensor, other_details: Tensor, sight: Sight, other_sight: Sight, options: Options
 ) -> Tensor:
-    """Return `difference_of` two images' responses at a level.
+    """Return the `difference_of` two images' responses at a level.
 
-    Each image by itself: equal images then take equal paths through the vectorised loops, and
-    their difference is exactly 0.
+    Each image is computed separately: equal images then take equal paths through the vectorised
+    loops, and their difference is exactly 0.
     """
     one, other = response(details, sight, options), response(other_details, other_sight, options)
     return difference_of(one, other, options)
@@ -295,10 +296,11 @@ def sights_of(
     chromatic: bool,
     grey: Tensor | None,
 ) -> list[Sight]:
-    """Return the sight of a level at the parents of each image, fewer than its nodes.
+    """Return each image's channel weighting of a level, at the parents, which are fewer than nodes.
 
-    ``parents`` are the lowpass of each, (B, 3, h, w); ``local``: in the local luminance. ``grey``,
-    (3,): the parents are one plane, and the cones' are so many times it.
+    ``parents`` are the lowpass planes (B, 3, h, w) of the images; ``local``: whether sensitivity
+    follows the local luminance. With ``grey`` (3,) the parents are one plane each, and the cone
+    planes are ``grey`` times it.
     """
     sights = []
     for plane in parents:
@@ -308,7 +310,7 @@ def sights_of(
         if local:
             sensitivity = sensitivity_at(parent, level, constants, chromatic)
         if grey is not None:
-            # Of one detail the three cones' contrasts, mixed, times the sensitivity.
+            # Per unit of detail: the contrasts of the three cones, mixed, times the sensitivity.
             mixed = mix(constants["opponents"], of_grey(scale, grey)).unsqueeze(2)
             sights.append(Sight(None, mixed * sensitivity))
             continue
@@ -317,7 +319,7 @@ def sights_of(
 
 
 def adapted_luminance(lowpass: Tensor, constants: Mapping[str, Tensor]) -> Tensor:
-    """Return the luminance (B, 1, h, w) that the eye is adapted to, cd/m2, its own light in it."""
+    """Return the adaptation luminance (B, 1, h, w) in cd/m2, the eye's own light included."""
     seen = mix(constants["luminance_of_cones"], lowpass).clamp_min(0.0)
     return seen + constants["dark_light"]
 
@@ -325,7 +327,7 @@ def adapted_luminance(lowpass: Tensor, constants: Mapping[str, Tensor]) -> Tenso
 def sensitivity_at(
     parent: Tensor, level: Level, constants: Mapping[str, Tensor], chromatic: bool
 ) -> Tensor:
-    """Return the contrast sensitivity in the local luminance, at the parents."""
+    """Return the contrast sensitivity at the local luminance of the parents."""
     luminance = adapted_luminance(parent, constants).unsqueeze(2)
     dark = torch.log2(1.0 + constants["dim_luminance"] / luminance)
     glare = torch.log2(1.0 + luminance / constants["glare_luminance"])
@@ -339,7 +341,7 @@ def sensitivity_at(
     if not chromatic:
         return achromatic
     dim = torch.exp2(-constants["chromatic_dimming"] * dark)
-    # Flat, for of planes with one channel compiled code would make a plane of channels.
+    # Flattened: from planes with one channel, compiled code would make a plane of channels.
     channels = achromatic.flatten(2), (level.sensitivity * dim).flatten(2)
     sensitivity: Tensor = torch.cat(channels, 1).unflatten(2, achromatic.shape[2:])
     return sensitivity

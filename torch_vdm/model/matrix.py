@@ -9,14 +9,14 @@ from torch import Tensor
 def mix(matrix: Tensor, planes: Tensor) -> Tensor:
     """Return the channels of ``planes`` mixed by ``matrix``.
 
-    Written as multiplications and additions: a matrix product would run in bfloat16 under
+    It is written as multiplications and additions: a matrix product would run in bfloat16 under
     autocast and in TF32 where a user allows it, and its last bits may depend on alignment, so
     that two equal images would differ.
 
     Parameters
     ----------
     matrix
-        (N, C); N rows are N output channels.
+        (N, C), one row per output channel.
     planes
         (B, C, ...), C of 1 or more.
 
@@ -41,6 +41,6 @@ def mix_row(row: Tensor, channels: Sequence[Tensor]) -> Tensor:
 def product(first: Tensor, second: Tensor) -> Tensor:
     """Return the matrix that mixes by ``second``, then by ``first``; (3, 3) each.
 
-    Not by ``@``, for the reasons of `mix`.
+    It does without ``@``, for the reasons given in `mix`.
     """
     return (first.unsqueeze(-1) * second).sum(1)

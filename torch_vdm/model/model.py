@@ -1,12 +1,11 @@
-"""The model: Fig. 2 in its order, from two images to what accumulates at every place.
+"""The model: Fig. 2 in order, from two images to what accumulates at every place.
 
-`difference` is the whole of it, and what every executor of `torch_vdm.run` is held to. The two
-observers differ in six places: the contrast sensitivity follows the local luminance or not
-(`Model.sights`), levels are divided by their gains or not (the constants), responses keep their
-sign or not (`torch_vdm.model.level`), the means of the images are compared or not
-(`Model.lowpass_difference`), border nodes count for the pixels that they have or not
-(``true_means``), and coarse differences are charged to the pixels that made them or not
-(`Model.charges`).
+`Model.difference` is the whole of it, and every executor of `torch_vdm.run` must reproduce it. The
+two observers differ in six places: whether contrast sensitivity follows the local luminance
+(`Model.sights`), levels are divided by their gains (the constants), responses keep their sign
+(`torch_vdm.model.level`), the means of the images are compared (`Model.lowpass_difference`),
+border nodes count for the pixels that they have (``true_means``), and coarse differences are
+charged to the pixels that caused them (`Model.charges`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -48,21 +47,21 @@ FILTER = ("gain", "cutoff", "order")
 
 
 class Model:
-    """What is computed of two images: the boxes of Fig. 2, with all that they depend on.
+    """What is computed from two images: the boxes of Fig. 2, with all that they depend on.
 
     Parameters
     ----------
     display, observer, transform, effects
         As in `torch_vdm.VDM`.
     constants
-        Their numbers as tensors, in the precision of the computation and where it is done.
+        Their numbers as tensors, in the precision and on the device of the computation.
     steps
         How steps are called; one after the other by default.
     grey
-        Whether the images' three channels are one, and one plane stands for the three cones. No
-        number changes but by rounding.
+        Whether the images' three channels are equal, so that one plane stands for the three cones.
+        Results change by rounding only.
     cubes
-        Whether the summation's exponent is 6, and no gradient by it is wanted.
+        Whether the summation exponent is 6, and needs no gradient.
     """
 
     def __init__(
@@ -85,7 +84,7 @@ class Model:
         self.cubes = cubes
         self.grey = self._of_grey() if grey else None
 
-    # Of one image.
+    # One image.
 
     def represent(self, image: Tensor) -> Cortex:
         """Return the cortex representation of an image (B, 3, H, W): display, cones, transform."""
@@ -93,7 +92,7 @@ class Model:
 
     def cone_planes(self, image: Tensor) -> Tensor:
         """Return the cone responses (B, 3, H, W) to an image: display, cone fundamentals."""
-        # Numbers as tensors: compiled code is specialised on others.
+        # Numbers are passed as tensors: compiled code is specialised on others.
         around = self.display.encoding, self.display.limit(image)
         if self.grey is not None:
             one = image[:, :1]
@@ -102,7 +101,7 @@ class Model:
         return self.steps.pixels(lambda part: self.steps(_light, part, *around, matrix), image)
 
     def _to_cones(self) -> Tensor:
-        """Return the matrix from linear values to cones: one mixing of all pixels, not two."""
+        """Return the matrix from linear values to cones, so that pixels are mixed only once."""
         matrix = self.constants["cones"]
         if self.display.encoding == "xyz":
             return matrix
@@ -113,7 +112,7 @@ class Model:
         return self._to_cones().sum(1)
 
     def cones(self, planes: Tensor) -> Tensor:
-        """Return the three cones' planes (B, 3, h, w) of what is linear in `cone_planes`."""
+        """Return the planes of the three cones (B, 3, h, w) for what is linear in `cone_planes`."""
         return of_grey(planes, self.grey)
 
     def decomposed(self, planes: Tensor) -> Cortex:
@@ -123,7 +122,7 @@ class Model:
     def decomposed_of(
         self, source: Tensor, planes: Tensor, mean: Tensor, grid: Grid | None = None
     ) -> Cortex:
-        """Return the same of what is `filtered`, the light that it is of, and the light's mean.
+        """Return the same from what is `filtered`, the light it comes from, and the light's mean.
 
         ``grid``: that of a part of an image.
         """
@@ -134,9 +133,9 @@ class Model:
         return lowpass_of_light(cortex, light, self.observer.true_means)
 
     def filtered(self, planes: Tensor, coarser: Tensor | None = None, finest: int = 0) -> Tensor:
-        """Return what is decomposed of cone planes: these, or their weighted contrast.
+        """Return what is decomposed: the cone planes themselves, or their weighted contrast.
 
-        ``coarser`` and ``finest`` as `filtering.weighted_contrast`.
+        ``coarser`` and ``finest`` are as in `filtering.weighted_contrast`.
         """
         if self.transform.csf == "levels":
             return planes
@@ -145,7 +144,7 @@ class Model:
         )
 
     def band_weights(self) -> filtering.Weights:
-        """Return what weights the bands of an image that is filtered."""
+        """Return the weights of the bands of an image that is filtered."""
         frequency = self.constants["band_frequencies"]
         bright = self._bright(frequency[None], torch.ones_like(frequency)[None])[0]
         passed = self._passed(frequency)
@@ -155,17 +154,17 @@ class Model:
     def responses(
         self, cortex: Cortex, sights: Sequence[Sight] | None = None
     ) -> tuple[Tensor, ...]:
-        """Return the responses of one image, one (B, channels, orientations, h, w) a level.
+        """Return the responses of one image, one (B, channels, orientations, h, w) per level.
 
-        From chromatic aberration to the transducer; level 0 first, 1 is threshold. ``sights``:
-        its `adaptation`, where that is known.
+        These include all boxes from chromatic aberration to the transducer; level 0 comes first,
+        and 1 is threshold. ``sights``: the image's `adaptation`, where that is known.
         """
         options = self.options()
         seen_at = zip(cortex.details, sights or self.adaptation(cortex), strict=True)
         return tuple(response(detail, sight, options) for detail, sight in seen_at)
 
     def adaptation(self, cortex: Cortex) -> list[Sight]:
-        """Return the sight of each level of one image, at its nodes."""
+        """Return the channel weighting of each level of one image, at its nodes."""
         levels = self.levels(cortex.finest, len(cortex.details))
         found = []
         for number, detail in enumerate(cortex.details):
@@ -173,17 +172,17 @@ class Model:
             found.append(sight.pushed(_size(detail), before=cortex.before[number]))
         return found
 
-    # Of two.
+    # Two images.
 
     def difference(self, test: Tensor, reference: Tensor) -> Tensor:
-        """Return the accumulated differences (B, 1, h, w) of two images, before the root."""
+        """Return the accumulated differences (B, 1, h, w) of two images, before the final root."""
         first, second = self.represent(test), self.represent(reference)
         local = self.local_differences(first, second)
         paths = Paths(local, self.changes(first, second), self.root(first, second))
         return self.descended(paths, first.before)
 
     def local_differences(self, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
-        """Return the local visual differences (Eq. 5), one (B, 1, h, w) a level, level 0 first."""
+        """Return the local visual differences (Eq. 5): (B, 1, h, w) per level, level 0 first."""
         levels = self.levels(first.finest, len(first.details))
         return tuple(
             self.local_difference(first, second, number, levels.only(number))
@@ -191,7 +190,7 @@ class Model:
         )
 
     def local_difference(self, first: Cortex, second: Cortex, number: int, level: Level) -> Tensor:
-        """Return the local visual difference (B, 1, h, w) of one level, the one of this number."""
+        """Return the local visual difference (B, 1, h, w) of the level of this number."""
         details, others = first.details[number], second.details[number]
         sight, other_sight = (
             sight.pushed(_size(details), first.items, first.before[number])
@@ -201,11 +200,11 @@ class Model:
         return local_difference(*images, self.options(), self.steps, first.items)
 
     def nothing(self, image: Tensor) -> Tensor:
-        """Return `difference` of an image (1, 3, H, W) and itself."""
+        """Return the `difference` of an image (1, 3, H, W) and itself."""
         return image.new_zeros(1, 1, *self.leaves((image.shape[-2], image.shape[-1])))
 
     def leaves(self, size: tuple[int, int]) -> tuple[int, int]:
-        """Return the sides of the plane of leaves: pixels, or nodes of 2 where none overlap.
+        """Return the size of the plane of leaves: pixels, or nodes of 2x2 where none overlap.
 
         An image of one pixel is its own node.
         """
@@ -217,12 +216,12 @@ class Model:
     def lowpass_difference(self, first: Cortex, second: Cortex) -> Tensor:
         """Return the weighted contrast between the means of two images, the lowpass term.
 
-        (B, channels, 1, 1), not negative, 1 at threshold; 0 for an observer that never compares
-        them. A uniform change is seen here and nowhere else.
+        It is (B, channels, 1, 1), not negative, 1 at threshold; and 0 for an observer that never
+        compares them. A uniform change is seen here and nowhere else.
         """
         one, other = self.cones(first.mean), self.cones(second.mean)
         if self.observer.lowpass_gains is None:
-            # Of the graph, so that an image of one pixel has a gradient.
+            # Part of the autograd graph, so that an image of one pixel has a gradient.
             return 0.0 * one[:, :1] + 0.0 * other[:, :1]
         contrast = weber_contrast(one, other, self.constants["dark_cones"])
         gains = self.constants["lowpass_gains"].view(-1, 1, 1)
@@ -230,12 +229,12 @@ class Model:
         return weighted.abs().clamp_max(LARGEST_DIFFERENCE)
 
     def root(self, first: Cortex, second: Cortex) -> Tensor:
-        """Return what every path begins with, (B, 1, 1, 1)."""
+        """Return the value that every path starts from, (B, 1, 1, 1)."""
         seen = self.lowpass_difference(first, second) ** self.constants["summation_exponent"]
         return seen.sum(1, keepdim=True)
 
     def changes(self, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
-        """Return the `charging.changes` of every level, level 0 first; none if none is charged."""
+        """Return the `charging.changes` of every level, level 0 first; none without charging."""
         if not self.observer.charging:
             return ()
         return tuple(self.change(first, second, number) for number in range(len(first.details)))
@@ -245,7 +244,7 @@ class Model:
         found: Tensor = self.steps(changes, first.lowpass[number], second.lowpass[number])
         if not self.quartered:
             return found
-        # The mean of the quarters that a node has.
+        # The mean over those quarters that a node has.
         top, left = first.grid.before(first.finest + len(first.details) - 1 - number)
         height, width = _size(found)
         sides = (left, (width + left) % 2, top, (height + top) % 2)
@@ -253,16 +252,16 @@ class Model:
 
     @property
     def quartered(self) -> bool:
-        """Whether lowpass planes have the quarters of nodes; see `lowpass_of_light`."""
+        """Whether lowpass planes hold the quarters of nodes; see `lowpass_of_light`."""
         return self.transform.csf == "filter" and self.transform.shifts == 1
 
     def descended(self, paths: Paths, before: Sequence[Before], items: int = 1) -> Tensor:
-        """Return what has accumulated down the paths at their leaves, (B, 1, h, w)."""
+        """Return what has accumulated at the leaves of all paths, (B, 1, h, w)."""
         charges = self.charges(paths.changes, items)
         return accumulate(paths.local, paths.root, items, before, charges)
 
     def charges(self, changes: Sequence[Tensor], items: int = 1) -> list[Charge] | None:
-        """Return what the nodes of each level are charged; None: all."""
+        """Return the shares that the nodes of each level are charged; None: all."""
         if not self.observer.charging:
             return None
         options = self.transform.shifts, self.transform.csf == "filter", items, self.steps.cached
@@ -273,7 +272,7 @@ class Model:
         return self.transform.grid(size, self.observer.true_means)
 
     def to_pixels(self, plane: Tensor, size: tuple[int, int], grid: Grid | None = None) -> Tensor:
-        """Return a plane of leaves at the pixels; ``grid``: that of a part of an image."""
+        """Return a plane of leaves at pixel resolution; ``grid``: that of a part of an image."""
         if self.transform.shifts > 1:  # the leaves of overlapping nodes are the pixels
             return plane
         grid = self.grid(size) if grid is None else grid
@@ -296,7 +295,7 @@ class Model:
         )
 
     def sights(self, level: Level, images: Sequence[Cortex], number: int) -> list[Sight]:
-        """Return the sight of a level, the one of this number, for each image, at its parents."""
+        """Return each image's channel weighting of the level of this number, at the parents."""
         if self.transform.csf == "filter":
             return [weights_alone(level)] * len(images)
         parents = [cortex.parent_lowpass(number) for cortex in images]
@@ -304,7 +303,7 @@ class Model:
         return sights
 
     def sight_options(self) -> tuple[dict[str, Tensor], bool, bool, Tensor | None]:
-        """Return what `sights_of` takes beside parents and level."""
+        """Return what `sights_of` takes besides parents and level."""
         local = self.observer.adaptation_luminance is None
         # No more than it needs: a compiled function checks every tensor that it is given.
         names = ("dark_cones", *(OF_LUMINANCE if local else ()))
@@ -315,7 +314,8 @@ class Model:
     def levels(self, finest: int, count: int) -> Levels:
         """Return what ``count`` levels respond to, from the level ``finest``; the coarsest first.
 
-        All levels at once: on small images the operations of a level cost more than its numbers.
+        All levels at once: on small images, calling a level's operations costs more than their
+        arithmetic.
         """
         some = slice(finest, finest + count)
         frequency, gain = (self.constants[name][some].flip(0) for name in ("frequencies", "gains"))
@@ -323,7 +323,7 @@ class Model:
         return Levels(passed, frequency, gain, self._bright(frequency, gain))
 
     def _passed(self, frequency: Tensor) -> Tensor:
-        """Return the share (levels, 3) of the cones' details that chromatic aberration leaves."""
+        """Return the fraction (levels, 3) of cone details that chromatic aberration passes."""
         if not self.effects.aberration:
             return torch.ones_like(frequency).unsqueeze(1).expand(-1, 3)
         of_eye = self.constants["aberration_cutoff"], self.constants["aberration_exponent"]
@@ -332,7 +332,7 @@ class Model:
     def _bright(self, frequency: Tensor, gain: Tensor) -> Tensor:
         """Return the sensitivity of all channels, or of C1 and C2 where the luminance is local.
 
-        (levels, channels, as many) from (levels, as many); in bright light, over the gain.
+        It is (levels, channels, n) from (levels, n), for bright light, and divided by the gain.
         """
         of, channels = self.constants, []
         if self.observer.adaptation_luminance is not None:
@@ -347,12 +347,12 @@ class Model:
 
 
 def weights_alone(level: Level) -> Sight:
-    """Return the sight of a level of filtered images: of details that are contrasts already."""
+    """Return the channel weighting of a level of filtered images: details are contrasts already."""
     return Sight(None, (1.0 / level.gain)[None, None])
 
 
 def _light(image: Tensor, encoding: str, limit: Tensor | None, matrix: Tensor) -> Tensor:
-    """Return the cone responses (B, 3, H, W) to an image; ``matrix`` is of linear values."""
+    """Return the cone responses (B, 3, H, W) to an image; ``matrix`` applies to linear values."""
     return cone_responses(linear_values(image, encoding, limit), matrix)
 
 

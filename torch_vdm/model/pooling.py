@@ -9,7 +9,7 @@ from torch_vdm.model.quadtree import apart, together
 def surround(responses: Tensor, items: int = 1) -> Tensor:
     """Repeat the border of (B, channels, orientations, h, w) once on every side.
 
-    Of each of ``items`` that lie below one another: `within` takes it off again.
+    This is done for each of ``items`` stacked vertically; `within` removes it again.
     """
     planes = responses if items == 1 else apart(responses[0], items)
     surrounded = functional.pad(planes, (1, 1, 1, 1, 0, 0), mode="replicate")
@@ -17,13 +17,13 @@ def surround(responses: Tensor, items: int = 1) -> Tensor:
 
 
 def within(pooled: Tensor, rows: int, items: int) -> Tensor:
-    """Return the ``rows`` of items that `surround` has made larger and `pool` has pooled as one.
+    """Return the ``rows`` of items that `surround` has padded and `pool` has pooled as one plane.
 
-    From (1, 1, items (h + 2) - 2, w) to (1, 1, items h, w).
+    The shape goes from (1, 1, items (h + 2) - 2, w) to (1, 1, items h, w).
     """
     if items == 1 or pooled.shape[-2] == rows:
         return pooled
-    # What lies between two items is of both of them.
+    # What lies between two items mixes both of them.
     return together(apart(functional.pad(pooled, (0, 0, 0, 2)), items)[..., :-2, :].contiguous())
 
 
@@ -32,7 +32,7 @@ POOLED = 9.0
 
 
 def pool_sums(surrounded: Tensor) -> Tensor:
-    """Return `POOLED` times what `pool` does, where that is divided by later, for less."""
+    """Return `POOLED` times what `pool` does, to be divided later, where that costs less."""
     rows = surrounded[..., :-2, :] + surrounded[..., 1:-1, :]
     rows = rows.add_(surrounded[..., 2:, :])
     return (rows[..., :-2] + rows[..., 1:-1]).add_(rows[..., 2:])
@@ -41,7 +41,7 @@ def pool_sums(surrounded: Tensor) -> Tensor:
 def pool(surrounded: Tensor) -> Tensor:
     """Return the mean of every node's 3x3 neighbourhood.
 
-    From (B, channels, orientations, h + 2, w + 2), made by `surround`, to (..., h, w). The paper
+    It is (..., h, w) from (B, channels, orientations, h + 2, w + 2), made by `surround`. The paper
     prints the size of the filter (against Sarnoff's 5x5) but not its weights: equal ones are a
     choice; a box of 3 nodes spans 2.2 cycles of its level, near the 2.5 of Wilson 1991.
     """
@@ -51,25 +51,25 @@ def pool(surrounded: Tensor) -> Tensor:
 def phase_energy(responses: Tensor, phases: int) -> Tensor:
     """Return the mean square of every ``phases`` successive orientations.
 
-    Of overlapping nodes and of quadrature pairs the energy is pooled: it hardly depends on the
-    phase of a grating, where the mean of absolute values does.
+    For overlapping nodes and quadrature pairs the energy is pooled: it hardly depends on the phase
+    of a grating, whereas the mean of absolute values does.
     """
     energy = responses * responses
     return energy.unflatten(2, (-1, phases)).mean(3) if phases > 1 else energy
 
 
 def surround_halves(energy: Tensor, nodes: int) -> Tensor:
-    """Repeat the border as `pool_halves` needs, over ``nodes`` nodes."""
+    """Repeat the border as `pool_halves` needs it for ``nodes`` nodes."""
     sides = (nodes, nodes - 1, nodes, nodes - 1, 0, 0)
     return functional.pad(energy, sides, mode="replicate")
 
 
 def pool_halves(surrounded: Tensor, nodes: int, dim: int) -> Tensor:
-    """Return along ``dim``, for every half of a node, the sum over those who cover it.
+    """Return along ``dim``, for every half of a node, the sum over the nodes that cover it.
 
-    The halves of a node are covered by two overlapping nodes, ``nodes`` times as many with the
-    nodes beside these: 3 of them is the 3x3 pooling of `pool` at each shift, and the mean of the
-    shifts, once the sum along both sides is divided by `covering`.
+    Each half is covered by two overlapping nodes, and by ``nodes`` times as many when their
+    neighbours are included. With 3 this is the 3x3 pooling of `pool` at each shift, averaged over
+    the shifts, once the sum along both axes is divided by `covering`.
     """
     length = surrounded.shape[dim] - 1
     total = surrounded.narrow(dim, 0, length) + surrounded.narrow(dim, 1, length)
@@ -81,5 +81,5 @@ def pool_halves(surrounded: Tensor, nodes: int, dim: int) -> Tensor:
 
 
 def covering(nodes: int) -> float:
-    """Return how many nodes `pool_halves` adds up for the half of a node, in x and in y."""
+    """Return how many nodes `pool_halves` adds up for the half of a node, over x and y."""
     return float((2 * nodes) ** 2)

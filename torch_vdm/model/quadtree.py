@@ -3,8 +3,8 @@
 A plane of h x w nodes has parents on a plane of ceil(h / 2) x ceil(w / 2) nodes. The parent of
 node (x, y) is (x // 2, y // 2). A plane with an odd side is padded by repeating its last row or
 column, level by level: padding the whole image to a square power of two would cost twice the
-pixels at 1920 x 1080. Where a `Grid` puts a node before the first, it is ceil((h + 1) / 2), and the
-parent of x is (x + 1) // 2. Several trees may lie below one another in one plane.
+pixels at 1920 x 1080. Where a `Grid` puts a node before the first, there are ceil((h + 1) / 2), and
+the parent of x is (x + 1) // 2. Several trees may be stacked vertically in one plane.
 """
 
 from torch import Tensor
@@ -13,7 +13,7 @@ from torch.nn import functional
 from torch_vdm.model.grid import NONE, Before
 from torch_vdm.model.interleave import interleaved
 
-# Planes with no more numbers are enlarged by torch's own operation, which is faster for them.
+# Planes with no more elements are upsampled by torch's own operation, which is faster for them.
 # Status: choice, measured.
 SMALL = 2**15
 
@@ -27,37 +27,37 @@ def pad_even(plane: Tensor) -> Tensor:
 
 
 def stacked(batch: Tensor) -> Tensor:
-    """Return the items of a batch (B, C, h, w) below one another, (1, C, B h, w)."""
+    """Return the items of a batch (B, C, h, w) stacked vertically, (1, C, B h, w)."""
     return together(batch.transpose(0, 1)).unsqueeze(0)
 
 
 def apart(planes: Tensor, items: int) -> Tensor:
-    """Return what lies below one another, (..., items h, w), as (..., items, h, w)."""
+    """Return what is stacked vertically, (..., items h, w), as (..., items, h, w)."""
     items_apart: Tensor = planes.unflatten(-2, (items, -1))
     return items_apart
 
 
 def together(planes: Tensor) -> Tensor:
-    """Return (..., items, h, w) below one another, (..., items h, w): the inverse of `apart`."""
+    """Return (..., items, h, w) stacked vertically, (..., items h, w): the inverse of `apart`."""
     return planes.flatten(-3, -2)
 
 
 def push(nodes: Tensor, size: tuple[int, int], items: int = 1, before: Before = NONE) -> Tensor:
     """Give every child on a plane of ``size`` = (h, w) the value of its parent.
 
-    ``nodes`` is (B, C, ..., ceil(h / 2), ceil(w / 2)), or so for h and w with what is put
-    ``before`` the first child; the root's plane, 1 x 1, is also its own parent plane. Of ``items``
-    trees below one another ``size`` is that of all of them.
+    ``nodes`` is (B, C, ..., ceil(h / 2), ceil(w / 2)), where h and w include what is put ``before``
+    the first child; the root's plane, 1 x 1, is also its own parent plane. With ``items`` trees
+    stacked vertically, ``size`` is that of all of them.
     """
     if nodes.numel() <= SMALL and nodes.is_floating_point():
         twice = (*[1.0] * (nodes.ndim - 4), 2.0, 2.0)
         children = functional.interpolate(nodes, scale_factor=twice)
     else:
-        # Columns, then rows: faster than repeating elements along one side and the other.
+        # Columns, then rows: faster than repeating elements along one axis and the other.
         rows = interleaved(nodes, nodes, -1).unsqueeze(-2)
         children = rows.expand(*rows.shape[:-2], 2, rows.shape[-1]).flatten(-3, -2)
     if (children.shape[-2], children.shape[-1]) == size:
-        return children  # no view, on which compiled code would be specialised
+        return children  # not a view: compiled code would be specialised on it
     top, left = before
     bottom, right = top + size[0] // items, left + size[1]
     if items > 1:

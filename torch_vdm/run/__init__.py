@@ -1,1 +1,1 @@
-"""How the model is computed: executors, each of which gives what `Model.difference` gives."""
+"""How the model is computed: executors that all give what `Model.difference` gives."""

@@ -1,8 +1,8 @@
 """The gradient of a level's local visual differences, worked out by hand.
 
-Autograd keeps some thirty planes of a level for the backward pass. Of the arguments alone all of
-them are known: here they are kept, and the rest is computed again, for less than it costs to
-store it. For the signed responses of nodes side by side.
+Autograd keeps some thirty planes of a level for the backward pass. All of them follow from the
+arguments: here only these are kept, and the rest is computed again, which costs less than storing
+it. This is for the signed responses of nodes that do not overlap.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,14 +30,14 @@ def local_difference_by_hand(
     masking: Tensor,
     summation: Tensor,
 ) -> Tensor:
-    """Return ``function`` of two images, their local visual difference, with this gradient.
+    """Return ``function`` of two images, their local visual difference, with its gradient by hand.
 
     Parameters
     ----------
     function
-        From details and sights to (B, 1, h, w), as `VDM` computes it.
+        From details and channel weightings to (B, 1, h, w), as `VDM` computes it.
     details, others, sight, other_sight
-        Of a level of two images.
+        Those of two images at a level.
     matrix
         (channels, 3), of Eq. 3.
     masking, summation
@@ -49,7 +49,7 @@ def local_difference_by_hand(
 
 
 def by_hand() -> bool:
-    """Return whether this gradient is of use: nothing traces or transforms the computation."""
+    """Return whether this gradient can be used: nothing traces or transforms the computation."""
     return (
         torch.is_grad_enabled()
         and not torch.compiler.is_compiling()
@@ -77,7 +77,7 @@ class _LocalDifference(torch.autograd.Function):
         images: tuple[Tensor, ...] = ctx.saved_tensors
         wanted: tuple[bool, ...] = ctx.needs_input_grad[4:]
         if torch.is_grad_enabled():
-            # It will be differentiated again: as autograd does it.
+            # It will be differentiated again, so this is left to autograd.
             images = tuple(image.view_as(image) for image in images)
             inputs = [image for image, want in zip(images, wanted, strict=True) if want]
             local = _apply(ctx.function, images)
@@ -101,18 +101,18 @@ def _slopes(
     masking: Tensor,
     summation: Tensor,
 ) -> list[Tensor | None]:
-    """Return the slopes by those of the ``images`` that are ``wanted``."""
+    """Return the gradients with respect to those of the ``images`` that are ``wanted``."""
     one, other = (_weighted(image, matrix) for image in (images[:3], images[3:]))
     difference = one.weighted - other.weighted
     energy = pool(surround(difference * difference))
     masks = pool(surround(masking_energy(one.weighted, other.weighted))).add_(1.0)
-    # The energy times what `unmasked` leaves; then its power of half the summation.
+    # The energy times the factor of `unmasked`; then its power of half the summation exponent.
     gain = torch.log2(masks).sub_(1.0).mul_(-2.0 * masking).exp2_()
     half = 0.5 * summation
     energy.mul_(gain)
     slope = torch.log2(energy.clamp_min(SMALLEST_DIFFERENCE)).mul_(half - 1.0).exp2_()
     slope.mul_(gradient.unsqueeze(2) * half)
-    # With its repeated border the box is its own transpose. Squares have twice their root's slope.
+    # With a repeated border the box is its own transpose. The slope of a square is twice its root.
     hidden = (slope * energy).sum(2, keepdim=True).mul_(-2.0 * masking).div_(masks)
     by_square = pool(surround(hidden)).mul_(2.0)
     by_difference = pool(surround(slope.mul_(gain))).mul_(difference).mul_(2.0)
@@ -123,7 +123,7 @@ def _slopes(
 
 
 class _Path(NamedTuple):
-    """What lies between the details of an image and its weighted contrast, (B, 3, ., h, w)."""
+    """The steps from the details of an image to its weighted contrast, (B, 3, ., h, w)."""
 
     contrast: Tensor
     opponent: Tensor
@@ -146,10 +146,10 @@ def _by_image(
     matrix: Tensor,
     wanted: Sequence[bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    """Return the slopes by details, scale and sensitivity, of which those ``wanted`` are made.
+    """Return the gradients by details, scale and sensitivity; only those ``wanted`` are computed.
 
-    From those by the weighted contrast, as far as it differs, and as far as it masks, over it.
-    Takes the path's planes for its own.
+    ``by_difference`` is the gradient by the weighted contrast through the difference, ``by_square``
+    that through the masking, divided by the contrast. The planes of ``path`` are overwritten.
     """
     if not any(wanted):
         return None, None, None

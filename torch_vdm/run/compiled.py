@@ -10,24 +10,24 @@ from typing import Any, NamedTuple
 
 import torch
 
-# Planes with fewer numbers stay uncompiled: a compiled call costs more than they do.
+# Planes with fewer elements stay uncompiled: a compiled call costs more than they do.
 # Status: choice.
 SMALLEST = 4096
 
-# Forms of one function that are kept, by dtype, gradients and options. Status: choice.
+# How many compiled forms of one function are kept, by dtype, gradients and options. Status: choice.
 MOST_FORMS = 256
 
-# Share of what is computed on the way that may be kept for the backward pass; the rest is computed
-# again there. Left alone, the compiler keeps masks, which are written number by number. Status:
+# The share of intermediate results that may be kept for the backward pass; the rest is recomputed
+# there. Left alone, the compiler keeps masks, which are written element by element. Status:
 # choice, measured.
 KEPT = 0.3
 
-# Whether `for_any_size` is in force: to ask the compiler's settings takes longer.
+# Whether `for_any_size` is in force: asking the compiler's settings takes longer.
 _is_set: ContextVar[bool] = ContextVar("_is_set", default=False)
 
 
 class _Settings(NamedTuple):
-    """Those of the compiler that are changed."""
+    """The settings of the compiler that are changed."""
 
     use_duck_shape: bool
     recompile_limit: int
@@ -35,8 +35,8 @@ class _Settings(NamedTuple):
 
     def for_any_size(self) -> "_Settings":
         return _Settings(
-            # Else two sides that are equal in the first image would be held equal for ever, and the
-            # first image that is not square would compile everything again.
+            # Otherwise two sides that are equal in the first image would be assumed equal for ever,
+            # and the first image that is not square would compile everything again.
             use_duck_shape=False,
             # For every mix of precision, gradients, display, observer and effects in one process.
             recompile_limit=max(MOST_FORMS, self.recompile_limit),
@@ -61,11 +61,11 @@ _changes: list[_Change] = []
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the compiled form of a pure function of tensors.
 
-    It serves every height and width. A batch of one is compiled apart from larger ones, so give
-    it one item at a time, or several below one another; and tensors that are no views, for it is
-    specialised on offsets too.
+    It serves every height and width. A batch of one is compiled separately from larger ones, so
+    pass one item at a time, or several stacked vertically. Do not pass views: it is specialised on
+    offsets too.
     """
-    # Imported where it is used: it takes longer than the rest of the package.
+    # Imported where it is used: this takes longer than the rest of the package.
     from torch._inductor import config as inductor
 
     specialised = torch.compile(
@@ -73,12 +73,12 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         dynamic=True,
         fullgraph=True,
         options={
-            # The functions and numbers that it names do not change; to check in every call that
-            # they have not takes longer than the rest of its checks.
+            # The functions and numbers that it refers to do not change; checking that in every
+            # call takes longer than the rest of its checks.
             "guard_filter_fn": torch.compiler.skip_guard_on_globals_unsafe,
-            # What the processor says of its vectors is believed, unless the user does not: to try
-            # them out compiles, and starts another process, for every kind. A compiler that knows
-            # torch's headers knows them.
+            # The vector instructions that the processor reports are trusted, unless the user set
+            # otherwise: trying them out compiles, and starts another process, for every kind. A
+            # compiler that knows torch's headers knows them.
             "cpp.vec_isa_ok": inductor.cpp.vec_isa_ok is not False,
         },
     )
@@ -96,7 +96,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextmanager
 def for_any_size() -> Iterator[None]:
-    """Let forms be compiled for any size, many of them be kept, and little of their numbers.
+    """Compile forms for any size, keep many of them, and keep few of their intermediate results.
 
     Every call does so by itself; around many calls it costs less than around each.
     """
@@ -114,8 +114,8 @@ def for_any_size() -> Iterator[None]:
 
     with _lock:
         before = now()
-        # Where settings are the process's, and not each thread's, another thread may have changed
-        # them already: then the last that is done sets them back.
+        # Where settings belong to the process, and not to each thread, another thread may have
+        # changed them already: then the last to finish restores them.
         change = next((change for change in _changes if change.to == before), None)
         if change is None:
             change = _Change(before, before.for_any_size())

@@ -1,8 +1,8 @@
 """The metric and the loss as operators, one node each in a graph that `torch.compile` makes.
 
-Traced through, all levels of a pyramid would become one graph, which takes the compiler half a
-minute for one size and far longer for a size that is symbolic. As an operator the module runs as it
-does outside, by the route that it takes there.
+If they were traced through, all levels of a pyramid would become one graph, which takes the
+compiler half a minute for one size and far longer for a symbolic size. As an operator the module
+runs as it does outside a graph, by the same route.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,14 +22,14 @@ _numbers = count(1)
 
 
 class Enrolled(nn.Module):
-    """A module that the operators know, and each copy of it by itself."""
+    """A module that the operators know; each of its copies is registered separately."""
 
     def __init__(self) -> None:
         super().__init__()
         self._enrol()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take the state of another, of which this is a copy."""
+        """Take the state of the module that this is a copy of."""
         super().__setstate__(state)  # type: ignore[no-untyped-call]  # torch's own, without types
         self._enrol()
 
@@ -41,7 +41,7 @@ class Enrolled(nn.Module):
 def is_wanted() -> bool:
     """Return whether a graph is being made that should have an operator in it.
 
-    Not one that is exported: that has to hold all that it computes.
+    An exported graph should not: it has to contain all that it computes.
     """
     return torch.compiler.is_dynamo_compiling() and not torch.compiler.is_exporting()
 
@@ -49,7 +49,7 @@ def is_wanted() -> bool:
 def difference_map(test: Tensor, reference: Tensor, number: int, power: bool) -> Tensor:
     """Return the map of an enrolled `PairMetric`, or its power, as an operator.
 
-    (B, 1, H, W) from (B, 3, H, W) twice. The backward pass computes the forward pass again.
+    It is (B, 1, H, W) from (B, 3, H, W) twice. The backward pass recomputes the forward pass.
     """
     seen: Tensor = _map(test, reference, number, power)
     return seen
@@ -58,8 +58,8 @@ def difference_map(test: Tensor, reference: Tensor, number: int, power: bool) ->
 def loss_of_items(test: Tensor, reference: Tensor, mask: Tensor | None, number: int) -> Tensor:
     """Return the loss (B,) of an enrolled `VDMLoss` as an operator.
 
-    From (B, 3, H, W) twice and weights (B, 1, H, W). The gradient is taken in the forward pass:
-    that of an item is a number times what is kept.
+    It takes (B, 3, H, W) twice and weights (B, 1, H, W). The gradient is computed in the forward
+    pass and kept; the backward pass multiplies that of each item by a number.
     """
     wanted = torch.is_grad_enabled()
     first, second = wanted and test.requires_grad, wanted and reference.requires_grad
@@ -152,7 +152,7 @@ def _loss(
         with torch.no_grad():
             items: Tensor = module.of_items(test, reference, mask)
         return items, _like(test, False, items.dtype), _like(reference, False, items.dtype)
-    # In the precision of the computation: they are cast when the loss's own scale is in them.
+    # In the computing precision: gradients are cast once the scale of the loss is included.
     dtype = computed_in(test, reference)
     items, found = _gradients(
         lambda *images: module.of_items(*images, mask),
@@ -203,7 +203,7 @@ def _gradients(
     first: bool,
     second: bool,
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-    """Return a function of two images, and the gradients of its sum by those that are wanted."""
+    """Return a function of two images, and the gradients of its sum by the images wanted."""
     with _as_outside():
         images = [
             image.detach().requires_grad_(want)
@@ -220,7 +220,7 @@ def _gradients(
 
 
 def _like(image: Tensor, wanted: bool, dtype: torch.dtype | None = None) -> Tensor:
-    """Return what a gradient of an image is, or none of its numbers; contiguous."""
+    """Return a contiguous tensor like the gradient of an image, or without elements."""
     return image.new_empty(image.shape if wanted else (0,), dtype=dtype or image.dtype)
 
 

@@ -1,6 +1,6 @@
-"""Images that are equal in most places: the finest levels where they differ alone.
+"""Images that are equal in most places: the finest levels are computed only where they differ.
 
-As in strips, but of rectangles that together hold all places near which the images differ:
+This works as in strips, but with rectangles that together cover all places near a difference:
 elsewhere nothing accumulates.
 """
 
@@ -22,7 +22,7 @@ from torch_vdm.run.whole import differences, level_difference
 # Levels that are computed in rectangles, from the finest. Status: choice, measured.
 LEVELS = 2
 
-# A rectangle is cut in two where less of it than this share is near a difference, down to so many
+# A rectangle is cut in two if less than this fraction of it is near a difference, down to so many
 # squares a side. Status: choice, measured.
 FULL, SMALLEST = 0.5, 8
 
@@ -35,8 +35,8 @@ def accumulated(
     Parameters
     ----------
     model, schedule
-        What is computed, and how its steps are. Coarse differences are charged, and contrast
-        sensitivity is of levels.
+        What is computed, and how. Coarse differences must be charged, and contrast sensitivity
+        must act on levels.
     test, reference
         The images.
     differing
@@ -47,7 +47,7 @@ def accumulated(
     options = schedule, model.observer.true_means
     grid, levels, octaves = model.grid(size), model.levels(0, count), count - shifts
     tiling = _tiling(size, shifts, transform.reach + AROUND * shifts, grid)
-    # Beyond pooling, filters and the parent, no level sees a difference, nor inherits one.
+    # Beyond the radius of pooling, filters and parent, no level has or inherits a difference.
     reach = -(-(transform.reach + 2 * shifts) // shifts) * 2**LEVELS
     near = -(-reach // side)
     touched = [_tile(box, side, tiling) for box in rectangles(_grown(differing, near))]
@@ -83,18 +83,18 @@ def accumulated(
 def _tiling(size: tuple[int, int], shifts: int, nodes: int, grid: Grid) -> Tiling:
     parent = 2 ** (LEVELS + 1)
     halo = -(-nodes // (2 * shifts)) * parent
-    # Cut by rectangles, and so never whole.
+    # It is cut by rectangles, and so never whole.
     return Tiling(size, (0, 0), LEVELS, halo, grid)
 
 
 def _grown(differing: Tensor, by: int) -> Tensor:
-    """Return squares and all up to so many beside them."""
+    """Return the squares, grown by so many squares on every side."""
     some = differing[None, None].float()
     return functional.max_pool2d(some, 2 * by + 1, 1, by)[0, 0] > 0.0
 
 
 def rectangles(squares: Tensor) -> list[Slices]:
-    """Return rectangles apart from one another that hold all squares (rows, columns) of a plane."""
+    """Return disjoint rectangles that cover all squares set in a plane (rows, columns)."""
     left, found = [(slice(0, squares.shape[0]), slice(0, squares.shape[1]))], []
     some = squares.cpu()
     while left:
@@ -141,7 +141,7 @@ def _fine(
 ) -> list[Tensor]:
     """Return local differences and changes of the fine levels of tiles, the coarsest first.
 
-    And last the lowpass of the first, which the coarser levels go on from.
+    The last entry is the lowpass of the first image, from which the coarser levels continue.
     """
     options = schedule, model.observer.true_means
     (one, reduced), (other, _) = (

@@ -1,4 +1,4 @@
-"""How a pair of images is computed: chosen in one place, from what is known before it is."""
+"""How a pair of images is computed: chosen in one place, from what is known in advance."""
 
 import math
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from torch_vdm.model.steps import Steps
 from torch_vdm.run.compiled import SMALLEST, compiled
 from torch_vdm.run.tiling import Tiling, cut
 
-# Planes with more numbers are computed in parts, which stay in a processor's cache. Status:
+# Planes with more elements are computed in parts, which stay in a processor's cache. Status:
 # choice, measured.
 LARGEST_AT_ONCE = 2**18
 
@@ -25,11 +25,11 @@ STRIP, STRIP_LEVELS = 2**19, 2
 # Pixels of a strip in which a large image is filtered. Status: choice, measured.
 BAND_STRIP = 2**17
 
-# Levels of at most as many nodes are computed at once: there an operation costs more than the
-# numbers that it works on. Status: choice, measured.
+# Levels of at most so many nodes are computed at once: there, calling an operation costs more than
+# its arithmetic. Status: choice, measured.
 FEW_NODES = 64 * 64
 
-# More nodes than a level has.
+# More nodes than any level has.
 EVERY_LEVEL = 2**62
 
 
@@ -39,19 +39,19 @@ class Job(NamedTuple):
     items: int
     size: tuple[int, int]
     stackable: bool
-    """Whether items may lie below one another: with `Haar` alone."""
+    """Whether items may be stacked vertically: with `Haar` alone."""
     gradients: bool
     """Whether a backward pass may follow."""
     one_sided: bool
-    """Whether one of the images alone has a gradient."""
+    """Whether only one of the two images has a gradient."""
     compiles: bool
     """Whether the compiled route was asked for."""
     checkpoints: bool
     """Whether little is to be kept for the backward pass."""
     accelerated: bool
-    """Whether it is done on a GPU or the like."""
+    """Whether it runs on a GPU or the like."""
     traced: bool
-    """Whether somebody else makes a graph of it, which is one whatever its pieces are."""
+    """Whether it is traced into someone else's graph, which is one whatever its pieces are."""
 
 
 @dataclass(frozen=True)
@@ -61,17 +61,17 @@ class Schedule(Steps):
     pieces: Literal["whole", "strips"] = "whole"
     """How the finest levels of an image are cut."""
     stacked: bool = False
-    """Whether the items of a batch lie below one another in planes of one."""
+    """Whether the items of a batch are stacked vertically in planes of one."""
     together: bool = False
     """Whether both images are decomposed as one batch."""
     compiled: bool = False
     """Whether large steps are compiled."""
     again: bool = False
-    """Whether the backward pass computes parts again, of which their arguments are kept."""
+    """Whether the backward pass recomputes parts, and only their arguments are kept."""
     cached: bool = True
     """As `Steps.cached`."""
     few: int = field(default_factory=lambda: FEW_NODES)
-    """Levels of at most so many nodes are computed at once."""
+    """Levels of at most this many nodes are computed at once."""
 
     @property
     def fused(self) -> bool:
@@ -79,7 +79,7 @@ class Schedule(Steps):
         return self.compiled
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return what a step returns, by its compiled form where that pays."""
+        """Return what a step returns, using its compiled form where that pays."""
         if self.compiled and _first(arguments).numel() >= SMALLEST:
             return compiled(function)(*arguments)
         return function(*arguments)
@@ -91,7 +91,7 @@ class Schedule(Steps):
         return checkpoint(function, *arguments, use_reentrant=False, preserve_rng_state=False)
 
     def pixels(self, function: Callable[..., Tensor], *planes: Tensor) -> Tensor:
-        """Return a function of pixels, a few rows at a time."""
+        """Return the value of a pointwise function of pixels, a few rows at a time."""
         if self.compiled:
             return function(*planes)
         if not self.cached:
@@ -104,7 +104,7 @@ class Schedule(Steps):
     def strips(
         self, function: Callable[[Tensor], tuple[Tensor, Tensor]], plane: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return `filtering`'s function of a plane; of a large one in strips."""
+        """Return `filtering`'s function of a plane, in strips if it is large."""
         size = plane.shape[-2], plane.shape[-1]
         few = math.prod(size) < 2 * BAND_STRIP
         if few or self.compiled or not self.cached or torch.compiler.is_compiling():
@@ -119,22 +119,22 @@ class Schedule(Steps):
         return contrast, lowpass
 
     def rows(self, height: int, numbers: int, most: int) -> int:
-        """Return how many of ``height`` rows, ``numbers`` numbers in all, are computed at once."""
+        """Return how many of ``height`` rows, ``numbers`` elements in all, are computed at once."""
         return height if self.compiled or not self.cached else max(1, most * height // numbers)
 
 
 def chosen(job: Job) -> Schedule:
-    """Return how a job is best done."""
+    """Return the best schedule for a job."""
     compiles = job.compiles and not job.traced
     again = job.checkpoints and job.gradients and not job.traced
     if job.accelerated:
-        # Few operations, each of as much as there is: one costs as long as a million numbers take.
+        # Few operations, as large as possible: calling one takes as long as a million elements.
         return Schedule(
             together=not job.one_sided,
             compiled=compiles,
             again=again,
             cached=False,
-            # Levels at once keep all that they compute.
+            # Levels computed at once keep all their intermediate results.
             few=FEW_NODES if again else EVERY_LEVEL,
         )
     # With gradients strips take less memory and more time, as checkpoints do.
@@ -153,9 +153,9 @@ def chosen(job: Job) -> Schedule:
 def at_once(job: Job) -> int:
     """Return how many items of a batch are computed at once.
 
-    Compiled code for one item serves a batch that is stacked: as many pixels as are not yet cut in
-    strips, and so few items that their planes of 2x2 nodes are not compiled: another form would be,
-    for a side that becomes 1.
+    Compiled code for one item serves a stacked batch. It has as many pixels as are not yet cut into
+    strips, and so few items that their planes of 2x2 nodes are not compiled: a side that becomes 1
+    would need another form.
     """
     if not job.compiles or job.traced:
         return job.items

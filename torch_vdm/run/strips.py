@@ -1,7 +1,7 @@
 """Large images, the finest levels strip by strip.
 
-A strip stays in the processor's cache, and its memory is used again for the next one, where whole
-planes would be asked from the system anew in every call.
+A strip stays in the processor's cache, and its memory is reused for the next one, whereas whole
+planes would be requested from the system anew in every call.
 """
 
 import torch
@@ -29,7 +29,7 @@ def accumulated(model: Model, schedule: Schedule, test: Tensor, reference: Tenso
     size, count = (test.shape[-2], test.shape[-1]), limits.STRIP_LEVELS + 1
     transform, shifts = model.transform, model.transform.shifts
     options = schedule, model.observer.true_means
-    # One level more than are computed, for the parents of the last.
+    # One level more than is computed, for the parents of the last.
     levels = model.levels(0, count)
     pooled = 2 * shifts - 1
     grid = model.grid(size)
@@ -40,12 +40,12 @@ def accumulated(model: Model, schedule: Schedule, test: Tensor, reference: Tenso
     filtered = transform.csf == "filter"
     charging = model.observer.charging
     sources = [test, reference]
-    if filtered:  # which needs the image whole
+    if filtered:  # a filter needs the whole image
         sources = [model.cone_planes(image) for image in sources]
         sources += [model.filtered(planes) for planes in sources]
 
     def strip_of(strip: Tile, *images: Tensor) -> list[Tensor]:
-        """Return what the rest needs and rows of two images, and what their levels add."""
+        """Return the row means of two images, what `rest` needs, and what their levels add."""
         parts: list[Tensor] = []
         strips: list[Cortex] = []
         for image, contrast in zip(images[:2], images[2:] or (None, None), strict=True):

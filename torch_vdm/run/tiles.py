@@ -1,8 +1,8 @@
 """Images larger than memory, one tile at a time.
 
-A tile begins where a node of the coarsest level that it is cut for has its parent, and comes with
-all that its nodes, their parents and their neighbours in pooling are made of. Its levels are then a
-part of the image's, and everything else about it is cut off. The coarser levels go on from a plane
+A tile begins where a parent of the coarsest level that it is cut for begins, and comes with all
+that its nodes, their parents and their neighbours in pooling are computed from. Its levels are then
+a part of the image's, and everything around it is cut off. The coarser levels continue from a plane
 that the tiles leave, no larger than one of them.
 """
 
@@ -27,11 +27,11 @@ from torch_vdm.run.schedule import Schedule
 from torch_vdm.run.tiling import Slices, Source, Tile, Tiling, check_sources, cut, read
 from torch_vdm.run.whole import differences
 
-# Called with how many steps are done, and of how many.
+# Called with the number of steps done, and the number of all steps.
 Progress = Callable[[int, int], None]
 
 # Takes parts of a test and a reference, (1, 3, h, w), and the item, y and x of their first pixel;
-# returns both as the model takes them, and where they are finite, if that is asked.
+# returns both as the model takes them, and where they are finite, if that is wanted.
 Check = Callable[[Tensor, Tensor, tuple[int, int, int]], tuple[Tensor, Tensor, Tensor | None]]
 
 
@@ -58,7 +58,7 @@ class _Pair(NamedTuple):
     planes: list[Tensor]
     """The cone responses to each."""
     seen: Tensor | None
-    """Where both are finite, if that is asked."""
+    """Where both are finite, if that is wanted."""
 
 
 def in_tiles(
@@ -72,12 +72,12 @@ def in_tiles(
 ) -> Iterator[Done]:
     """Yield what accumulates down the paths to the leaves of every tile of a test and a reference.
 
-    ``side``: pixels a side of a tile, at most. ``square``: parts are checked in whole squares of so
-    many pixels. ``progress`` as `VDM.tiled`.
+    ``side``: the largest side of a tile, in pixels. ``square``: parts are checked in whole squares
+    of so many pixels a side. ``progress`` is as in `VDM.tiled`.
     """
     items, size = check_sources(*sources)
     transform, shifts = model.transform, model.transform.shifts
-    # Spatial pooling takes in fewer nodes than charging does.
+    # Spatial pooling needs fewer nodes than charging does.
     nodes = transform.reach + AROUND * shifts
     grid = model.grid(size)
     tiling = Tiling.fit(size, side, shifts, nodes, grid)
@@ -142,8 +142,8 @@ def within_tile(
 ) -> Tensor:
     """Return what accumulates down the paths to the leaves of a tile, (1, 1, h, w).
 
-    ``local`` and ``changes`` are of the tile's levels, the coarsest first, with what is around it;
-    ``coarse`` is what has accumulated above these levels, of the whole image.
+    ``local`` and ``changes`` are those of the tile's levels, the coarsest first, with what is
+    around it; ``coarse`` is what the whole image has accumulated above these levels.
     """
     shifts = model.transform.shifts
     places = [tile.within(2 ** (level + 1) // shifts) for level in range(tiling.levels)][::-1]
@@ -175,7 +175,7 @@ def _coarse_contrasts(
     tiling: Tiling,
     step: Callable[[], None],
 ) -> list[Tensor]:
-    """Return the weighted contrast of both images without their `_scales`."""
+    """Return the weighted contrast of both images without their finest `_scales`."""
     scales = _scales(tiling)
     planes: tuple[list[Tensor], list[Tensor]] = [], []
     for tile in tiling:
@@ -233,7 +233,7 @@ def _coarse(
 
 
 def _in_squares(part: Slices, size: tuple[int, int], square: int) -> Slices:
-    """Return a part made larger to whole squares of so many pixels."""
+    """Return a part extended to whole squares of so many pixels a side."""
     rows, columns = (
         slice(side.start // square * square, min(-(-side.stop // square) * square, length))
         for side, length in zip(part, size, strict=True)
@@ -242,7 +242,7 @@ def _in_squares(part: Slices, size: tuple[int, int], square: int) -> Slices:
 
 
 def _scales(tiling: Tiling) -> int:
-    """Return how many scales are filtered in tiles: fewer than levels, for they reach further."""
+    """Return how many scales are filtered in tiles, fewer than levels: their radius is larger."""
     return max(tiling.levels - 2, 1)
 
 
@@ -250,11 +250,11 @@ class _Around(NamedTuple):
     """What a tile is computed from."""
 
     part: Slices
-    """What is read: the tile with its halo, and of a filtered image with what its filter needs."""
+    """What is read: the tile with its halo and, for a filtered image, what its filter needs."""
     inner: Slices | None
-    """Where in it lie the tile and its halo, if that is not all."""
+    """Where the tile and its halo lie in it, if they are not all of it."""
     pixels: Slices
-    """Where in it lie the tile's own pixels."""
+    """Where the tile's own pixels lie in it."""
     contrasts: list[Tensor] | list[None]
     """What `_coarse_contrasts` gives there, for each image."""
 
@@ -263,7 +263,7 @@ def _around(tile: Tile, tiling: Tiling, contrasts: list[Tensor] | None) -> _Arou
     """Return what a tile is computed from, where ``contrasts`` are those of the whole images."""
     if contrasts is None:
         return _Around(tile.around, None, tile.within(1), [None, None])
-    # Wherever the nodes lie, a filter's samples lie where those of the paper's grid do.
+    # A filter's samples lie on the paper's grid, wherever the nodes lie.
     scales = _scales(tiling)
     wide = tiling.wider(tile, bands.halo(scales))
     whole = Tile(wide.around, wide.around)

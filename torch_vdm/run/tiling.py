@@ -21,9 +21,9 @@ SMALLEST_TILE = 4
 class Source(Protocol):
     """An image, or a batch, that is read part by part: (3, H, W) or (B, 3, H, W).
 
-    A tensor, an array, a memory-mapped file (`numpy.load` with ``mmap_mode="r"``), an array of
-    h5py or zarr, or any object of one's own with these two. Floating point as `VDM` takes it, or
-    whole numbers of 8 or 16 bits, which stand for 0 to 1.
+    It may be a tensor, an array, a memory-mapped file (`numpy.load` with ``mmap_mode="r"``), an
+    array of h5py or zarr, or any object with these two members. It has floating-point values as
+    `VDM` takes them, or integers of 8 or 16 bits, which stand for 0 to 1.
     """
 
     @property
@@ -31,7 +31,7 @@ class Source(Protocol):
         """(3, H, W) or (B, 3, H, W)."""
 
     def __getitem__(self, index: Any, /) -> Any:
-        """Return the part that slices name, as a tensor or what NumPy takes for an array."""
+        """Return the part that slices select, as a tensor or what NumPy accepts as an array."""
 
 
 Slices = tuple[slice, slice]
@@ -42,12 +42,12 @@ def _ends(side: slice) -> tuple[int, int]:
 
 
 class Tile(NamedTuple):
-    """A part of an image, and the part with all that it is computed from."""
+    """A part of an image, and the larger part that it is computed from."""
 
     part: Slices
     """Rows and columns of the image."""
     around: Slices
-    """The same with its halo, as far as the image goes."""
+    """The same with its halo, as far as the image extends."""
     grid: Grid = PAPERS
     """Where the nodes lie on the image."""
 
@@ -102,10 +102,10 @@ class Tiling:
     ) -> "Tiling":
         """Return a tiling of an image of ``size`` with tiles of at most ``tile`` pixels a side.
 
-        The levels of tiles have ``shifts`` nodes in the width of one, and need ``nodes`` nodes
-        around each. There are as few as leave a plane no larger than a tile to the others: the halo
-        doubles with every level. Tiles and halos begin where the coarsest one's parents do, which
-        ``grid`` says, so that the levels of a tile are a part of the image's.
+        The levels of tiles have ``shifts`` nodes per node width, and need ``nodes`` nodes around
+        each. There are just enough of them to leave a plane no larger than a tile to the others,
+        because the halo doubles with every level. Tiles and halos begin where the parents of the
+        coarsest level do, as ``grid`` says, so that the levels of a tile are a part of the image's.
         """
         if not (isinstance(tile, int) and tile >= SMALLEST_TILE):
             raise ValueError(
@@ -128,26 +128,26 @@ class Tiling:
         nodes: int,
         grid: Grid = PAPERS,
     ) -> "Tiling":
-        """Return a tiling by strips as wide as the image, of about as many pixels.
+        """Return a tiling by strips as wide as the image, of about so many pixels each.
 
-        ``levels``, ``shifts``, ``nodes`` and ``grid`` as in `fit`.
+        ``levels``, ``shifts``, ``nodes`` and ``grid`` are as in `fit`.
         """
         parent = 2 ** (levels + 1)
         halo = -(-nodes // (2 * shifts)) * parent
-        # No thinner than so many halos, which are computed twice.
+        # No thinner than so many halos, because halos are computed twice.
         rows = max(pixels // (size[1] * parent) * parent, 4 * halo)
         return cls(size, (rows, size[1]), levels, halo, grid)
 
     def plain(self, pixels: int) -> "Tiling":
-        """Return the tiling of the paper's grid, with halos wider by so many pixels or a few more.
+        """Return the same tiling on the paper's grid, with halos wider by ``pixels`` or a few more.
 
-        Its tiles begin at multiples of what is a node of any level of theirs.
+        Its tiles begin at multiples of the node size of every level of theirs.
         """
         parent = 2 ** (self.levels + 1)
         return replace(self, halo=self.halo + -(-pixels // parent) * parent, grid=PAPERS)
 
     def wider(self, tile: Tile, pixels: int) -> Tile:
-        """Return all around a tile as a part, and around it so many pixels or a few more.
+        """Return a tile with its halo as the part, and ``pixels`` or a few more around that.
 
         These begin and end where tiles of `plain` may.
         """
@@ -162,21 +162,21 @@ class Tiling:
         return Tile(tile.around, (rows, columns))
 
     def grid_of(self, part: Slices) -> Grid:
-        """Return the grid of a part that begins as tiles do, for their levels."""
+        """Return the grid of a part that begins where tiles do, for their levels."""
         if self.whole:
             return self.grid
         return self.grid.part((part[0].start, part[1].start), self.levels + 1)
 
     def joined(self, parts: Sequence[Tensor]) -> Tensor:
-        """Return the plane of the image of one part (B, C, h, w) a tile, row by row."""
+        """Return the plane of the image from one part (B, C, h, w) per tile, row by row."""
         across = self.across
         rows = [torch.cat(list(parts[n : n + across]), -1) for n in range(0, len(parts), across)]
         return torch.cat(rows, -2)
 
     def split_rows(self, image: Tensor) -> Iterator[Tensor]:
-        """Yield what each strip is computed with, of an image (B, C, H, W).
+        """Yield the rows of an image (B, C, H, W) that each strip is computed from.
 
-        Cut once and put together again, so that a gradient comes back in one piece.
+        The image is cut once and its pieces are joined, so that a gradient comes back in one piece.
         """
         edges = sorted({edge for strip in self for edge in _ends(strip.around[0])})
         parts = image.split([end - begin for begin, end in pairwise(edges)], -2)
@@ -207,7 +207,7 @@ class Tiling:
                 yield Tile((rows, columns), around, self.grid)
 
     def _parts(self, axis: int) -> list[slice]:
-        """Return where tiles begin and end along a side: one that is no longer is not cut."""
+        """Return where tiles begin and end along a side, which is not cut if it is no longer."""
         length, most = self.size[axis], self.sides[axis]
         if length <= most:
             return [slice(0, length)]
@@ -225,10 +225,10 @@ def cut(plane: Tensor, part: Slices) -> Tensor:
 
 
 def read(source: Source, item: int, part: Slices) -> Tensor:
-    """Return a part of an item of a source, (1, 3, h, w), of floating point."""
+    """Return a part of an item of a source, (1, 3, h, w), in floating point."""
     index = (slice(None), *part) if len(source.shape) == 3 else (item, slice(None), *part)
     pixels = source[index]
-    # A copy: a memory-mapped file's pages need not stay, and it may not be written to.
+    # A copy: the pages of a memory-mapped file need not stay, and it may be read-only.
     image = pixels if isinstance(pixels, Tensor) else torch.from_numpy(np.array(pixels))
     if image.dtype in (torch.uint8, torch.uint16):
         image = image.to(torch.float32) / torch.iinfo(image.dtype).max
@@ -236,7 +236,7 @@ def read(source: Source, item: int, part: Slices) -> Tensor:
 
 
 def whole(source: Source) -> Tensor:
-    """Return all of a source (3, H, W), (1, 3, H, W)."""
+    """Return all of a source (3, H, W) as (1, 3, H, W)."""
     height, width = source.shape[-2:]
     return read(source, 0, (slice(0, height), slice(0, width)))
 

@@ -1,4 +1,4 @@
-"""Levels one by one, of whole planes; the coarsest at once, in a row."""
+"""Whole planes, level by level; the coarsest levels at once, with their nodes in a row."""
 
 import itertools
 import math
@@ -37,7 +37,7 @@ def accumulated(model: Model, schedule: Schedule, test: Tensor, reference: Tenso
     if not schedule.stacked:
         first, second = model.represent(test), model.represent(reference)
         return compared(model, schedule, first, second)
-    # Below one another: compiled code for one image serves a batch.
+    # Stacked vertically: compiled code for one image serves a batch.
     options, items = (schedule, model.observer.true_means), len(test)
     first, second = (
         Haar().decompose(model.cone_planes(stacked(image)), *options, items)
@@ -61,7 +61,7 @@ def differences(model: Model, schedule: Schedule, first: Cortex, second: Cortex)
 def local_differences(
     model: Model, schedule: Schedule, first: Cortex, second: Cortex
 ) -> tuple[Tensor, ...]:
-    """Return `Model.local_differences`: the responses of a level are taken and dropped."""
+    """Return `Model.local_differences`, dropping the responses of a level once they are used."""
     levels = model.levels(first.finest, len(first.details))
     few = _few(schedule, first)
     return (
@@ -83,8 +83,8 @@ def level_difference(
         sight.pushed(_size(details), items, first.before[number])
         for sight in model.sights(level, (first, second), number)
     )
-    # One orientation at a time where the planes are large and no orientation masks another: what is
-    # computed on the way then stays in the cache. Compiled code keeps nothing.
+    # One orientation at a time where the planes are large and no orientation masks another:
+    # intermediate results then stay in the cache. Compiled code keeps none.
     at_once = orientations = details.shape[2]
     if not (options.signed and options.masking):
         large = schedule.rows(orientations, details.numel(), limits.LARGEST_AT_ONCE) < orientations
@@ -93,7 +93,7 @@ def level_difference(
     def of(one: Tensor, other: Tensor, sight: Sight, other_sight: Sight) -> Tensor:
         return local_difference(one, other, sight, other_sight, options, schedule, items)
 
-    # Where the gradient is known by hand, nothing needs to be kept.
+    # Where the gradient is worked out by hand, nothing needs to be kept.
     fixed = options.matrix, options.transducer_exponent, options.summation_exponent
     known = (
         by_hand()
@@ -106,7 +106,7 @@ def level_difference(
         and not any(constant.requires_grad for constant in fixed)
     )
     local = []
-    # Itself where it is not cut, for compiled code is specialised on views.
+    # A plane that is not cut is passed itself: compiled code is specialised on views.
     parts, other_parts = (
         (plane,) if at_once == orientations else plane.split(at_once, 2)
         for plane in (details, others)
@@ -124,7 +124,7 @@ def level_difference(
 def _of_few(
     model: Model, schedule: Schedule, first: Cortex, second: Cortex, few: int, levels: Levels
 ) -> list[Tensor]:
-    """Return the local visual differences of the ``few`` coarsest levels, nodes in a row."""
+    """Return the local visual differences of the ``few`` coarsest levels, with nodes in a row."""
     if few == 0:
         return []
     items, options = first.items, model.options()
@@ -136,7 +136,7 @@ def _of_few(
         sight = weights_alone(level)
         difference = response_difference(details[0], details[1], sight, sight, options)
     else:
-        # Both images in one batch, where nothing is computed.
+        # Both images in one batch: nothing is computed here.
         images = first, second
         parents = _in_a_row(
             push(
@@ -151,13 +151,13 @@ def _of_few(
         seen_at = (both, level, *model.sight_options())
         difference = schedule(response_difference_at, *details, seen_at, options)
     around = [surrounded(plane, options, items=items) for plane in _planes(difference, sizes)]
-    # Beside one another along the longer side, where the least is left to fill up.
+    # Side by side along the longer axis, which needs the least padding.
     along = -1 if sizes[-1][0] <= sizes[-1][1] else -2
     gathered: Tensor = schedule(pooled_difference, _joined(around, along), options)
     starts = itertools.accumulate((plane.shape[along] for plane in around), initial=0)
     local = []
     for start, plane, (rows, columns) in zip(starts, around, sizes, strict=False):
-        # What was put around the items is still between them.
+        # The padding around the items is still between them.
         long = rows + (items - 1) * (plane.shape[-1] - columns)
         part = gathered.narrow(along, start, (long, columns)[along])[..., :long, :columns]
         local.append(within(part, rows, items))
@@ -165,7 +165,7 @@ def _of_few(
 
 
 def _changes(model: Model, schedule: Schedule, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
-    """Return `Model.changes`, those of the coarsest levels at once."""
+    """Return `Model.changes`, computing those of the coarsest levels at once."""
     if not model.observer.charging:
         return ()
     few = 0 if model.quartered else _few(schedule, first)
@@ -204,9 +204,9 @@ def _planes(row: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Tensor]:
 
 
 def _joined(planes: Sequence[Tensor], along: int) -> Tensor:
-    """Return planes (..., h, w) beside one another in one, along its last or last but one side.
+    """Return planes (..., h, w) joined into one along the last or the last but one dimension.
 
-    The other side is that of the longest; shorter ones go on with zeros.
+    The other dimension is that of the longest; shorter ones are padded with zeros.
     """
     lengths = [plane.shape[-3 - along] for plane in planes]
     padded = []

@@ -1,8 +1,8 @@
-"""Smooth frequency bands of an image, which add up to it: what filters it by contrast sensitivity.
+"""Smooth frequency bands that add up to an image, to filter it by contrast sensitivity.
 
-A Laplacian pyramid (Burt and Adelson 1983) whose finest octave is parted once more, at the image's
-own density: an eye's sensitivity falls too fast over the two octaves that its first band has.
-Weighted band by band, with weights that may differ from place to place, and gathered again, an
+They are a Laplacian pyramid (Burt and Adelson 1983) whose finest octave is split once more, at the
+image's own density: the eye's sensitivity falls too fast over the two octaves of its first band.
+When the bands are weighted, with weights that may vary from place to place, and summed again, the
 image is filtered by whatever the weights follow, such as the local luminance.
 """
 
@@ -21,38 +21,38 @@ from torch_vdm.model.cortex.transform import DEEPEST
 from torch_vdm.model.interleave import interleaved
 from torch_vdm.model.steps import PLAIN, Steps
 
-# Weights of the pyramid's lowpass, cos(pi f)^6: Burt and Adelson's five taps leave aliases that
-# move a threshold by 2 dB with the phase of a grating. Status: choice, measured.
+# Weights of the pyramid's lowpass, cos(pi f)^6: Burt and Adelson's five taps leave aliasing that
+# moves a threshold by 2 dB with the phase of a grating. Status: choice, measured.
 LOWPASS = (1 / 64, 6 / 64, 15 / 64, 20 / 64, 15 / 64, 6 / 64, 1 / 64)
 
-# Where the weights of the second and the third band are settled, in cycles/pixel; that of each next
-# one at half of it. About what these bands have most of. Status: choice.
+# Frequencies at which the weights of the second and third band are set, in cycles/pixel; each
+# further one is half the previous. They are about the bands' peaks. Status: choice.
 SECOND, NEXT = 0.1764, 0.0775
 
-# Planes with more numbers are gathered in parts, which stay in the processor's cache.
+# Planes with more elements are summed in parts, which stay in the processor's cache.
 # Status: choice, measured.
 LARGEST_AT_ONCE = 2**18
 
 # Bands that constants are made for.
 MOST = DEEPEST + 1
 
-# How far off, in samples of a plane, lies what a place of its `Scale` is made of. Follows from the
-# weights.
+# The radius, in samples of a plane, of what a place of its `Scale` is computed from. It follows
+# from the weights.
 REACH = 10
 
 
 class Scale(NamedTuple):
-    """The bands of a batch of planes that are of these planes' own density.
+    """The bands of a batch of planes that have these planes' own density.
 
     Attributes
     ----------
     bands
-        (B, C, h, w) each, the finest first: one, but two of an image.
+        (B, C, h, w) each, the finest first: one, but two for an image.
     around
         (B, C, h, w): the lowpass at the same places, without these bands and all finer ones.
     lowpass
-        The same, (B, C, ceil(h / 2), ceil(w / 2)), before it is brought to these places: what the
-        next scale is parted from.
+        The same, (B, C, ceil(h / 2), ceil(w / 2)), before it is expanded to these places: the next
+        scale is split from it.
     """
 
     bands: tuple[Tensor, ...]
@@ -63,9 +63,9 @@ class Scale(NamedTuple):
 def halo(count: int) -> int:
     """Return how many pixels around a part of an image `gathered` needs at most to be right there.
 
-    Where its ``count`` finest scales are parted from the part, and all others from the whole image.
+    The ``count`` finest scales are split from the part, and all others from the whole image.
     """
-    # Behind the border of a part the lowpass of a scale is wrong over 5 samples at most.
+    # Next to the border of a part the lowpass of a scale is wrong over at most 5 samples.
     wrong = 0
     for _ in range(count):
         wrong = max(REACH + 5, 2 * (wrong + 2))
@@ -73,7 +73,7 @@ def halo(count: int) -> int:
 
 
 def lowpass(image: Tensor, count: int, steps: Steps = PLAIN) -> Tensor:
-    """Return what is left of (B, C, H, W) after its ``count`` finest scales."""
+    """Return what is left of (B, C, H, W) without its ``count`` finest scales."""
     here = image
     for scale in range(count):
         here = reduced(_smooth(here, steps) if scale == 0 else here, steps)
@@ -81,7 +81,7 @@ def lowpass(image: Tensor, count: int, steps: Steps = PLAIN) -> Tensor:
 
 
 def parted(plane: Tensor, finest: bool, steps: Steps = PLAIN) -> Scale:
-    """Part a scale's bands from (B, C, h, w), the image if ``finest``."""
+    """Split a scale's bands from (B, C, h, w), the image if ``finest``."""
     here = _smooth(plane, steps) if finest else plane
     rest = reduced(here, steps)
     around = expanded(rest, (here.shape[-2], here.shape[-1]), steps)
@@ -97,7 +97,7 @@ def _smooth(image: Tensor, steps: Steps) -> Tensor:
 
 
 def gathered(planes: Sequence[Tensor], steps: Steps = PLAIN) -> Tensor:
-    """Add up one plane (B, C, h, w) a scale, the finest first, to one of the finest size."""
+    """Sum one plane (B, C, h, w) per scale, the finest first, into one of the finest size."""
     total = planes[-1]
     for plane in reversed(planes[:-1]):
         rows = steps.rows(plane.shape[-2], plane.numel(), LARGEST_AT_ONCE)
@@ -124,16 +124,16 @@ def reduced(plane: Tensor, steps: Steps = PLAIN) -> Tensor:
 
 
 def expanded(plane: Tensor, size: tuple[int, int], steps: Steps = PLAIN) -> Tensor:
-    """Return a plane at the ``size`` of the next finer one, smooth between its own samples."""
+    """Return a plane at the ``size`` of the next finer one, interpolated smoothly."""
     columns = steps(_expanded_columns, plane, size[0])
     rows: Tensor = steps(_expanded_rows, columns, size[1])
     return rows
 
 
 def surrounded(plane: Tensor, width: int, dim: int) -> Tensor:
-    """Continue a plane by ``width`` samples on both sides: mirrored, or repeated where short.
+    """Pad a plane by ``width`` samples on both sides: mirrored, or repeated if it is too short.
 
-    A repeated border gives a grating another mean beyond it, which is seen.
+    A repeated border gives a grating another mean beyond it, which is visible.
     """
     sides = (width, width, 0, 0) if dim == -1 else (0, 0, width, width)
     mode = "reflect" if plane.shape[dim] > width else "replicate"
@@ -141,8 +141,8 @@ def surrounded(plane: Tensor, width: int, dim: int) -> Tensor:
 
 
 def _parted_rows(plane: Tensor) -> Tensor:
-    # The lowpass that parts the finest octave has weights of 1/4, 1/2, 1/4: the mean of neighbours,
-    # twice. Status: choice; half is left at a quarter of a cycle a pixel.
+    # The lowpass that splits the finest octave has weights of 1/4, 1/2, 1/4: the mean of
+    # neighbours, taken twice. Status: choice; half is left at a quarter of a cycle per pixel.
     padded = surrounded(plane, 1, -1)
     means = torch.lerp(padded[..., :-1], padded[..., 1:], 0.5)
     return torch.lerp(means[..., :-1], means[..., 1:], 0.5)
@@ -171,7 +171,7 @@ def _expanded_columns(plane: Tensor, height: int) -> Tensor:
 
 
 def _expanded(plane: Tensor, dim: int) -> Tensor:
-    """Return what lies at the samples of a plane and after each, in turn along ``dim``."""
+    """Return a plane's values at its samples and half-way after each, in turn along ``dim``."""
     length = plane.shape[dim]
     padded = surrounded(plane, 2, dim)
     before, here, after, far = (padded.narrow(dim, tap, length) for tap in (1, 2, 3, 4))
@@ -181,10 +181,10 @@ def _expanded(plane: Tensor, dim: int) -> Tensor:
 
 
 def share(band: int, frequency: float) -> float:
-    """Return what of a grating of ``frequency`` cycles/pixel a band has, once gathered.
+    """Return the share of a grating of ``frequency`` cycles/pixel that a band has in the sum.
 
-    0 is the finest, and all add up to 1. Every reduction and expansion passes the grating once
-    each; what aliases is not counted.
+    Band 0 is the finest, and all shares add up to 1. The grating passes every reduction and every
+    expansion once; aliasing is not counted.
     """
     left = math.cos(math.pi * frequency) ** 2
     if band == 0:
@@ -199,16 +199,16 @@ def share(band: int, frequency: float) -> float:
 
 
 def frequencies() -> tuple[float, ...]:
-    """Return the frequency in cycles/pixel at which each band's weight is settled."""
+    """Return the frequency in cycles/pixel at which each band's weight is set."""
     return (0.5, SECOND, *(NEXT / 2.0**scale for scale in range(MOST - 2)))
 
 
 @lru_cache
 def weights() -> tuple[tuple[float, ...], ...]:
-    """Return the matrix that makes weights of bands of what a filter is to pass.
+    """Return the matrix that turns the desired response of a filter into weights of bands.
 
-    It takes what is to pass at `frequencies`, and undoes that a band has something of its
-    neighbours' frequencies too: with these weights exactly that passes there.
+    The response is given at `frequencies`. The matrix compensates for the overlap of neighbouring
+    bands: with these weights the filter has exactly that response there.
     """
     shares = [[share(band, frequency) for band in range(MOST)] for frequency in frequencies()]
     return tuple(tuple(row) for row in np.linalg.inv(shares).tolist())

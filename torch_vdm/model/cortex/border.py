@@ -2,16 +2,17 @@
 
 Where nodes do not begin or end with the image, the first and the last node of a side hold fewer
 pixels than the others, and may lack their sibling. A pair of siblings l and r along a side has a
-mean r + w (l - r) and a detail h (l - r), with w = h = 1/2 as in Eq. 2 between the borders. There:
+mean r + w (l - r) and a detail h (l - r), with w = h = 1/2 as in Eq. 2 between the borders. At a
+border:
 
-- the *lowpass* is the mean of the pixels that the pair has; the eye is adapted to that of its
-  *window*, the nodes as the details take them: beside the lowpass alone a bright wall above a black
-  last row had a contrast without bound;
-- of the *details* a node that holds the share s of its pixels is weakened to n + s (m - n), m its
-  mean and n that of the node beside it, as if the pixels that it lacks were like these. A node
-  without sibling gets the node beside it for one, so that its details are those of a window over
-  the border. Where two nodes are all that there is, they keep the mean of their pixels and differ
-  by the smaller share.
+- the *lowpass* is the mean of the pixels that the pair has. The eye is adapted to that of its
+  *window*, the nodes as the details take them: relative to the lowpass alone, a bright wall above a
+  black last row had unbounded contrast;
+- in the *details*, a node that holds the fraction s of its pixels is weakened to n + s (m - n),
+  where m is its mean and n that of its neighbour, as if the missing pixels were like the
+  neighbour's. A node without a sibling uses its neighbour as one, so that its details are those of
+  a window across the border. If a side has only two nodes, they keep the mean of their pixels, and
+  their difference is weighted by the smaller fraction.
 """
 
 from functools import lru_cache
@@ -25,12 +26,12 @@ from torch_vdm.model.grid import Side
 
 
 class Pair(NamedTuple):
-    """What is made of two siblings."""
+    """The weights of two siblings."""
 
     own: float
     """w of the mean of their own pixels."""
     completed: float
-    """w of the mean in the details across the other side."""
+    """w of the mean that enters the details along the other axis."""
     half: float
     """h of the details."""
 
@@ -39,7 +40,7 @@ INSIDE = Pair(0.5, 0.5, 0.5)
 
 
 class Weights(NamedTuple):
-    """The same for all pairs along a side of length n, as planes."""
+    """The same for all n pairs along a side, as tensors."""
 
     own: Tensor
     """(n,)."""
@@ -55,16 +56,16 @@ def is_inside(side: Side, nodes: int) -> bool:
 
 
 def ends(side: Side, nodes: int) -> tuple[Pair, Pair]:
-    """Return what is made of the first and of the last pair of a side."""
+    """Return the weights of the first and of the last pair of a side."""
     first, last = side.first, side.last
-    if nodes == 1:  # beside itself
+    if nodes == 1:  # its own sibling
         return INSIDE, INSIDE
     if nodes == 2:
         half = 0.5 * min(first, last)
         if side.before == 0:
             mean = first / (first + last)
             return (Pair(mean, mean, half),) * 2
-        # Each with the other: (last, first) and (last, first).
+        # Each is paired with the other: (last, first) and (last, first).
         mean = last / (first + last)
         return Pair(0.0, mean, half), Pair(1.0, mean, half)
     if side.before == 0:
@@ -81,11 +82,11 @@ def ends(side: Side, nodes: int) -> tuple[Pair, Pair]:
 def weights(
     sides: tuple[Side, Side], nodes: tuple[int, int], like: Tensor
 ) -> tuple[Weights, Weights]:
-    """Return what is made of every pair along h and along w, of so many nodes each.
+    """Return the weights of every pair along h and along w, for so many nodes each.
 
-    In the precision of ``like``, and where it is.
+    They have the precision and the device of ``like``.
     """
-    # Kept: to make them takes longer than to use them on small planes, and on a device it waits.
+    # Cached: making them takes longer than using them on small planes, and makes a device wait.
     if type(like) is Tensor and not torch.compiler.is_compiling():
         return _kept(sides, nodes, like.dtype, like.device)
     return _made(sides, nodes, like.dtype, like.device)
@@ -100,7 +101,7 @@ def _kept(*of: Any) -> tuple[Weights, Weights]:
 def _made(
     sides: tuple[Side, Side], nodes: tuple[int, int], dtype: torch.dtype, device: torch.device
 ) -> tuple[Weights, Weights]:
-    # No tensor twice, where both are alike: compiled code is specialised on that.
+    # Never one tensor for both, even if they are equal: compiled code is specialised on that.
     down, across = (
         Weights(*(torch.tensor(row, dtype=dtype, device=device) for row in _rows(side, count)))
         for side, count in zip(sides, nodes, strict=True)
@@ -116,7 +117,7 @@ def _rows(side: Side, nodes: int) -> list[tuple[float, ...]]:
 
 
 def with_siblings(plane: Tensor, sides: tuple[Side, Side]) -> Tensor:
-    """Return planes (..., C, h, w) with the nodes beside them for siblings where they lack one."""
+    """Return planes (..., C, h, w) in which nodes without a sibling have their neighbour as one."""
     (top, bottom), (left, right) = (
         (side.before, (nodes + side.before) % 2)
         for side, nodes in zip(sides, plane.shape[-2:], strict=True)
@@ -135,13 +136,13 @@ def analyse_at_border(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the lowpass, the details and the means of the windows of planes `with_siblings`.
 
-    (B, C, h, w), (B, C, 3, h, w) and (B, C, h, w). ``down`` and ``across``: of the pairs along h
-    and w.
+    They are (B, C, h, w), (B, C, 3, h, w) and (B, C, h, w). ``down`` and ``across`` are the weights
+    of the pairs along h and w.
     """
     left, right = even[..., 0::2], even[..., 1::2]
     between = left - right
     own = torch.addcmul(right, across.own, between)
-    # The mean across for d2; the details for d1 and d3.
+    # The mean across is for d2, the detail for d1 and d3.
     mean, detail = torch.addcmul(right, across.completed, between), across.half * between
     down = Weights(*(weight.unsqueeze(-1) for weight in down))
     top, bottom = own[..., 0::2, :], own[..., 1::2, :]

@@ -2,8 +2,8 @@
 
 P. J. Burt and E. H. Adelson, The Laplacian Pyramid as a Compact Image Code (IEEE Transactions on
 Communications 31, 1983). Filters are additions of slices: faster here than a convolution, and in
-full precision under autocast and TF32. Rows and columns are steps of their own, for compiled code
-would filter the rows anew for each tap of a column.
+full precision under autocast and TF32. Rows and columns are separate steps: otherwise compiled code
+would filter the rows again for each tap of a column.
 """
 
 import math
@@ -15,15 +15,15 @@ from torch.nn import functional
 from torch_vdm.model.interleave import interleaved
 from torch_vdm.model.steps import PLAIN, Steps
 
-# Weights of the lowpass, of sum 1; a = 3/8. Status: source.
+# Weights of the lowpass, with a sum of 1; a = 3/8. Status: source.
 CENTRE, NEXT, OUTER = 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0
 
 
 def along(plane: Tensor, weights: Sequence[float], dim: int, step: int = 1) -> Tensor:
     """Correlate with even or odd weights along ``dim``, -1 or -2, at every ``step``-th place.
 
-    Their number is odd; ``dim`` shortens by it less one. Taps of equal size are added, or
-    subtracted, before they are weighted.
+    Their number n is odd; ``dim`` becomes n - 1 shorter. Taps of equal magnitude are added or
+    subtracted before they are weighted.
     """
     last = len(weights) - 1
     centre = last // 2
@@ -45,7 +45,7 @@ def along(plane: Tensor, weights: Sequence[float], dim: int, step: int = 1) -> T
 
 
 def response(weights: Sequence[float], frequency: float) -> float:
-    """Return what even or odd weights leave of a grating of ``frequency`` cycles/sample."""
+    """Return the gain of even or odd weights for a grating of ``frequency`` cycles/sample."""
     centre = len(weights) // 2
     phases = [2.0 * math.pi * frequency * (tap - centre) for tap in range(len(weights))]
     even = sum(weight * math.cos(phase) for weight, phase in zip(weights, phases, strict=True))
@@ -54,7 +54,7 @@ def response(weights: Sequence[float], frequency: float) -> float:
 
 
 def lowpass_response(frequency: float) -> float:
-    """Return what one reduction leaves of a grating of ``frequency`` cycles/sample."""
+    """Return the gain of one reduction for a grating of ``frequency`` cycles/sample."""
     return response((OUTER, NEXT, CENTRE, NEXT, OUTER), frequency)
 
 
@@ -73,7 +73,7 @@ def reduce(plane: Tensor, steps: Steps = PLAIN) -> Tensor:
 
 
 def expand(plane: Tensor, size: tuple[int, int], steps: Steps = PLAIN) -> Tensor:
-    """Return a plane at the ``size`` of the next finer one, smooth between its own samples."""
+    """Return a plane at the ``size`` of the next finer one, interpolated smoothly."""
     rows: Tensor = steps(_expanded_rows, plane, size[1])
     columns: Tensor = steps(_expanded_columns, rows, size[0])
     return columns

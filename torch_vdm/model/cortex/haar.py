@@ -21,18 +21,18 @@ from torch_vdm.model.grid import PAPERS, Grid, thirds
 from torch_vdm.model.quadtree import apart, pad_even, together
 from torch_vdm.model.steps import PLAIN, Steps
 
-# The exponent of the sum over coefficients by which a diagonal grating is made as strong as a
-# vertical one; that of the detection score. Status: choice.
+# The exponent of the sum over coefficients in which a diagonal grating is made as strong as a
+# vertical one; it is that of the detection score. Status: choice.
 EXPONENT = 4.0
 
-# Gratings over the octave for which they are made so, from this frequency in cycles/pixel, and the
-# levels that see them.
+# For this: the number of gratings over an octave, its lowest frequency in cycles/pixel, and the
+# number of levels that respond to them.
 OCTAVE, LOWEST, SEEING = 16, 1 / 32, 8
 
 
 @dataclass(frozen=True)
 class Haar:
-    """The paper's transform: O(N), one coefficient a pixel and cone, not shift-invariant.
+    """The paper's transform: O(N), one coefficient per pixel and cone, not shift-invariant.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class Haar:
     Raises
     ------
     ValueError
-        Where ``csf`` is neither.
+        If ``csf`` is neither.
     """
 
     csf: CSF = "levels"
@@ -53,7 +53,7 @@ class Haar:
     reach = 1
 
     def __post_init__(self) -> None:
-        """Refuse what is no option."""
+        """Refuse an unknown option."""
         checked_csf(self.csf)
 
     def grid(self, size: tuple[int, int], true_means: bool) -> Grid:
@@ -71,9 +71,9 @@ class Haar:
     ) -> Cortex:
         """Decompose (B, C, H, W) by Eq. 2 down to one node, step by step.
 
-        ``true_means``: a node at the border counts for the pixels that it has. Else for as many
-        as its siblings, as the repeated last row or column of an odd side makes it. ``items``: so
-        many images lie below one another. ``grid``: that of a part of an image.
+        ``true_means``: a node at the border counts for the pixels that it has. Otherwise it counts
+        for as many as its siblings, as the repeated last row or column of an odd side makes it.
+        ``items``: how many images are stacked vertically. ``grid``: that of a part of an image.
 
         Returns
         -------
@@ -93,7 +93,7 @@ class Haar:
         *,
         grid: Grid | None = None,
     ) -> tuple[Cortex, Tensor]:
-        """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
+        """Return the finest levels, and what `rest` continues from; see `Transform.begin`."""
         size = (planes.shape[-2], planes.shape[-1])
         base = Base(planes, 0, size, planes[..., :1, :1])
         cortex = self.coarser(base, steps, true_means, count, grid=grid)
@@ -112,7 +112,7 @@ class Haar:
         *,
         grid: Grid | None = None,
     ) -> Tensor:
-        """Return the means of nodes of 2^octaves pixels; arguments as `decompose`."""
+        """Return the means of nodes of 2^octaves pixels; arguments as in `decompose`."""
         size = (planes.shape[-2], planes.shape[-1])
         if grid is None:
             grid = self.grid(size, true_means)
@@ -120,7 +120,7 @@ class Haar:
 
     def resume(self, base: Base, steps: Steps = PLAIN, true_means: bool = False) -> Cortex:
         """Decompose the rest of an image; see `Transform.resume`."""
-        # The first step is a level that tiles have.
+        # The first step is a level that tiles already have.
         grid = self.grid(base.size, true_means)
         _, (plane,), _ = levels(base.plane, base.octaves, base.size, steps, true_means, grid, 1)
         rest = base._replace(plane=plane, octaves=base.octaves + 1)
@@ -137,7 +137,7 @@ class Haar:
     ) -> Cortex:
         """Return the levels of `decompose`, at most ``count``, without its ``base.octaves`` finest.
 
-        The plane of ``base`` has the means of nodes of 2^octaves pixels.
+        The plane of ``base`` holds the means of nodes of 2^octaves pixels.
         """
         plane, octaves, size, mean = base
         if grid is None:
@@ -153,8 +153,8 @@ class Haar:
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
         """Return the same, for all three orientations.
 
-        For a filtered image d3 has the gain that makes up for what d1 and d2 have less of a
-        diagonal grating; on the paper's levels it has theirs.
+        For a filtered image the gain of d3 makes up for the weaker response of d1 and d2 to a
+        diagonal grating; on the paper's levels it equals theirs.
         """
         frequency, gain = _peak(level_from_finest)
         if self.csf == "levels":
@@ -174,8 +174,8 @@ def levels(
 ) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
     """Return details, lowpass and windows of the ``count`` finest levels, the finest first.
 
-    ``planes`` (B, C, h, w) are the means of nodes of 2^octaves pixels a side, which lie as ``grid``
-    says, of an image of ``size`` = (H, W) pixels; or (1, C, items h, w) of ``items`` of them.
+    ``planes`` (B, C, h, w) are the means of nodes of 2^octaves pixels a side, placed by ``grid`` on
+    an image of ``size`` = (H, W) pixels; or (1, C, items h, w) for ``items`` of them.
     """
     found = _descended(
         planes,
@@ -189,7 +189,7 @@ def levels(
         analyse_at_border,
         items,
     )
-    # Inside an image a window is the node.
+    # Away from the border a window is the node.
     windows = [window[0] if window else lowpass for lowpass, _, *window in found]
     return [detail for _, detail, *_ in found], [lowpass for lowpass, *_ in found], windows
 
@@ -202,7 +202,7 @@ def lowpasses(
     count: int = DEEPEST,
     grid: Grid = PAPERS,
 ) -> list[Tensor]:
-    """Return the lowpass that `levels` does, without the details."""
+    """Return the lowpass planes that `levels` does, without the details."""
     found = _descended(
         planes, octaves, size, true_means, grid, count, PLAIN, _means, means_at_border
     )
@@ -212,10 +212,10 @@ def lowpasses(
 def lowpass_of_light(cortex: Cortex, light: Base, true_means: bool) -> Cortex:
     """Return a representation of filtered planes with the mean and lowpass of their light.
 
-    What is decomposed behind a filter is no light; which pixels differ is asked of the light.
+    What is decomposed behind a filter is not light, but the light decides which pixels differ.
     ``light``: cone responses, from which the levels of ``cortex`` or finer ones follow. The lowpass
-    of a level are the means of the quarters of its nodes, on the plane of its details where these
-    overlap and else on one of twice its sides.
+    of a level holds the means of the quarters of its nodes, on the plane of its details where these
+    overlap, and otherwise on one with sides twice as long.
     """
     if not cortex.details:
         return cortex._replace(mean=light.mean)
@@ -238,13 +238,13 @@ def _descended(
     at_border: Callable[[Tensor, Weights, Weights], tuple[Tensor, ...]],
     items: int = 1,
 ) -> list[tuple[Tensor, ...]]:
-    """Return what is made of a plane of even sides, the lowpass first, level by level.
+    """Return what a function gives for a plane of even sides, the lowpass first, level by level.
 
-    ``inside``: by a function of whole nodes alone. ``at_border``: by one that knows which are not.
+    ``inside`` is a function of whole nodes alone; ``at_border`` one that knows which are not whole.
     """
 
     def each(function: Callable[..., Tensor], *planes: Tensor) -> Tensor:
-        """Return what a function makes of every item by itself."""
+        """Apply a function to every item separately."""
         if items == 1:
             return function(*planes)
         return together(function(*(apart(plane[0], items) for plane in planes))).unsqueeze(0)
@@ -284,9 +284,9 @@ def _peak(level_from_finest: int) -> tuple[float, float]:
     """Maximise the magnitude of the wavelet's own response.
 
     A wavelet of 2m pixels, the mean of m pixels minus the mean of the next m, halved, passes the
-    frequency f (cycles/pixel) with sin(pi m f)^2 / (m sin(pi f)). Its greatest maximum is the one
-    between 1/(4m) and 1/(2m), where 2 m sin(pi f) cos(pi m f) - cos(pi f) sin(pi m f), the sign of
-    its slope, passes 0.
+    frequency f (cycles/pixel) with the gain sin(pi m f)^2 / (m sin(pi f)). Its largest maximum lies
+    between 1/(4m) and 1/(2m), where 2 m sin(pi f) cos(pi m f) - cos(pi f) sin(pi m f), which has
+    the sign of its slope, crosses 0.
     """
     m = 2**level_from_finest
     if m == 1:
@@ -300,23 +300,23 @@ def _peak(level_from_finest: int) -> tuple[float, float]:
 
 
 def wavelet_response(half: int, frequency: float) -> float:
-    """Return what a wavelet of 2 ``half`` pixels leaves of a grating, cycles/pixel."""
+    """Return the gain of a wavelet of 2 ``half`` pixels for a grating, in cycles/pixel."""
     return math.sin(math.pi * half * frequency) ** 2 / (half * math.sin(math.pi * frequency))
 
 
 def window_response(half: int, frequency: float) -> float:
-    """Return what the mean of 2 ``half`` pixels leaves of a grating, cycles/pixel."""
+    """Return the gain of the mean of 2 ``half`` pixels for a grating, in cycles/pixel."""
     turn = math.pi * frequency
     return math.sin(2 * half * turn) / (2 * half * math.sin(turn))
 
 
 @lru_cache
 def diagonal_share() -> float:
-    """Return d3's gain over that of d1 and d2 with which all directions are as strong.
+    """Return d3's gain, relative to that of d1 and d2, that makes all directions equally strong.
 
     A grating of equal sensitivity on all levels is decomposed at 0 and at 45 degrees; the sums over
-    all coefficients, to the power of EXPONENT, are equal on average over an octave. Of coarse
-    levels, which are alike.
+    all coefficients, to the power of EXPONENT, are equal on average over an octave. This is for
+    coarse levels, which are alike.
     """
     straight = less = diagonal = 0.0
     for place in range(OCTAVE):

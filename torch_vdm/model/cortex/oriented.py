@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_vdm.model.cortex.gaussian import along, response
 
-# Taps, their distance, and the coefficients of x in the odd filters. Status: source.
+# Taps, their spacing, and the coefficients of x in the odd filters. Status: source.
 TAPS, SPACING = 9, 0.67
 LINEAR, CROSSED_LINEAR = 2.254, 0.7515
 
@@ -27,17 +27,17 @@ CROSSED = tuple((x * x - CROSSED_LINEAR) * math.exp(-x * x) for x in _PLACES)
 
 
 def even_gain(frequency: float) -> float:
-    """Return what the even filter leaves of a grating in its direction, in cycles/sample."""
+    """Return the gain of the even filter for a grating in its direction, in cycles/sample."""
     return response(SECOND, frequency) * sum(GAUSSIAN)
 
 
 def odd_gain(frequency: float) -> float:
-    """Return what the odd filter leaves of a grating in its direction, in cycles/sample."""
+    """Return the gain of the odd filter for a grating in its direction, in cycles/sample."""
     return response(THIRD, frequency) * sum(GAUSSIAN)
 
 
 def across(plane: Tensor, step: int = 1) -> tuple[Tensor, ...]:
-    """Return the rows of (..., h, w + 8) by the five one-dimensional filters."""
+    """Filter the rows of (..., h, w + 8) with the five one-dimensional filters."""
     filters = (GAUSSIAN, FIRST, SECOND, THIRD, CROSSED)
     return tuple(along(plane, weights, -1, step) for weights in filters)
 
@@ -48,8 +48,8 @@ def quadrature(
     """Return the even and odd responses at 0, 45, 90 and 135 degrees, (..., h, w) each.
 
     ``rows`` are what `across` gives, (..., h + 8, w); ``even`` and ``odd`` are the gains that
-    responses are divided by. 0 degrees is a vertical grating, 45 one whose phase grows to the right
-    and down.
+    responses are divided by. 0 degrees is a vertical grating, 45 one whose phase increases to the
+    right and down.
     """
     smooth, first, second, third, crossed = rows
     xx = along(second, GAUSSIAN, -2, step) / even

@@ -24,16 +24,14 @@ from torch_vdm.model.steps import PLAIN, Steps
 
 @dataclass(frozen=True)
 class StationaryHaar:
-    """The Haar wavelets at four shifts a node, four times the coefficients of `Haar`.
+    """The Haar wavelets at four shifts per node, with four times the coefficients of `Haar`.
 
-    A node lies at every half of a node in x and in y. At half a node alone, a grating of one cycle
-    a node is met at its peaks or at its zeros only, wherever the nodes lie. So every second row and
-    column of nodes is shifted by a quarter more, and any two by two neighbours lie at four
-    different quarters of a node both in x and in y. The finest level, whose nodes are 2 pixels
-    wide, has no quarters.
+    Nodes lie half a node apart in x and in y. With these shifts alone, all nodes would sample a
+    grating of one cycle per node at its peaks, or all at its zeros. So every second row and column
+    of nodes is shifted by a quarter more, and any 2x2 neighbours lie at four different quarters of
+    a node both in x and in y. The finest level, whose nodes are 2 pixels wide, has no quarters.
 
-    The paper's plane d3 is tuned to diagonal gratings; it has the frequency and the gain that it
-    has for these.
+    The paper's plane d3 is tuned to diagonal gratings; its frequency and gain are those for these.
 
     Parameters
     ----------
@@ -53,7 +51,7 @@ class StationaryHaar:
     reach = 5
 
     def __post_init__(self) -> None:
-        """Refuse what is no option."""
+        """Refuse an unknown option."""
         checked_csf(self.csf)
 
     def grid(self, size: tuple[int, int], true_means: bool) -> Grid:  # noqa: ARG002
@@ -68,14 +66,14 @@ class StationaryHaar:
         *,
         grid: Grid | None = None,  # noqa: ARG002  # as `grid`
     ) -> Cortex:
-        """Decompose (B, C, H, W) to the coarsest level; arguments as `Haar.decompose`.
+        """Decompose (B, C, H, W) to the coarsest level; arguments as in `Haar.decompose`.
 
         Returns
         -------
         Cortex
-            ``details[l]`` is (B, C, 3, h, w) as in `Haar`, but the finest is of the image's own
-            size and each next one of half its sides, rounded up. The node (y, x) begins at the
-            pixel (2^k y, 2^k x) of level k from the finest, or 2^(k - 1) after it.
+            ``details[l]`` is (B, C, 3, h, w) as in `Haar`, but the finest has the image's own size
+            and each coarser one half its sides, rounded up. On level k from the finest, the node
+            (y, x) begins at the pixel (2^k y, 2^k x), or 2^(k - 1) after it.
         """
         size = (planes.shape[-2], planes.shape[-1])
         mean = mean_of(planes)
@@ -95,7 +93,7 @@ class StationaryHaar:
         *,
         grid: Grid | None = None,  # noqa: ARG002  # as `grid`
     ) -> tuple[Cortex, Tensor]:
-        """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
+        """Return the finest levels, and what `rest` continues from; see `Transform.begin`."""
         size = (planes.shape[-2], planes.shape[-1])
         means = lowpasses(planes, 0, size, true_means, count - 2)
         parts = [planes, planes, *means]
@@ -115,7 +113,7 @@ class StationaryHaar:
         *,
         grid: Grid | None = None,  # noqa: ARG002  # as `grid`
     ) -> Tensor:
-        """Return the means of nodes of 2^octaves pixels; arguments as `decompose`."""
+        """Return the means of nodes of 2^octaves pixels; arguments as in `decompose`."""
         size = (planes.shape[-2], planes.shape[-1])
         return [planes, *lowpasses(planes, 0, size, true_means, octaves)][octaves]
 
@@ -128,7 +126,7 @@ class StationaryHaar:
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
         """Return the best frequency, cycles/pixel, and its gain for d1, d2 and d3.
 
-        For a filtered image those of `Haar`.
+        For a filtered image they are those of `Haar`.
         """
         if self.csf == "filter":
             return Haar("filter").peaks(level_from_finest)
@@ -143,10 +141,10 @@ class StationaryHaar:
         steps: Steps,
         true_means: bool,
     ) -> Cortex:
-        """Return the levels from ``finest`` on, of the means that are the parts of their nodes."""
+        """Return the levels from ``finest`` on, from the means of the parts of their nodes."""
         details: list[Tensor] = []
         lowpass: list[Tensor] = []
-        # Of what the image is adapted to, nothing is asked after its filter.
+        # Behind a filter, what the eye is adapted to is no longer needed.
         means = self.csf == "levels"
         for level, part in enumerate(parts, finest):
             faded = _faded(part, PAPERS.sides(size, max(level - 1, 0))) if true_means else part
@@ -154,7 +152,7 @@ class StationaryHaar:
             detail, *lowest = steps(analyse, faded, means)
             details.append(detail)
             lowpass += lowest
-        # A node may begin before its parent, where that is shifted. Had it been within, the parent
+        # A node may begin before its parent, where that is shifted. If it were inside, the parent
         # would have at least a quarter of its light.
         windows = [
             torch.maximum(parent, 0.25 * functional.max_pool2d(nodes, 2, ceil_mode=True))
@@ -166,7 +164,7 @@ class StationaryHaar:
 
 
 def _faded(parts: Tensor, sides: tuple[Side, Side]) -> Tensor:
-    """Weaken a last row or column that has only a share r of its pixels.
+    """Weaken a last row or column that has only a fraction r of its pixels.
 
     R becomes L + 2 r / (1 + r) (R - L), where L is its neighbour, so that (L + R) / 2 is the mean
     of the real pixels of both.
@@ -186,14 +184,14 @@ def _combined(
 ) -> list[Tensor]:
     """Return details and, with ``means``, lowpass, Eq. 2, of the four quarters of nodes.
 
-    Of a fourth of each the sums, left and right, and the differences, above and below.
+    ``sums`` and ``differences`` of left and right are those of a fourth of each, above and below.
     """
     details = (differences[0] + differences[1], sums[0] - sums[1], differences[0] - differences[1])
     return [torch.stack(details, 2), *([sums[0] + sums[1]] if means else [])]
 
 
 def _halves(parts: Tensor, means: bool) -> list[Tensor]:
-    """Return what `_combined` does of nodes of 2 x 2 parts that begin at every part."""
+    """Return what `_combined` does for nodes of 2 x 2 parts that begin at every part."""
     padded = functional.pad(0.25 * parts, (0, 1, 0, 1), mode="replicate")
     left, right = padded[..., :-1], padded[..., 1:]
     # Every row is the upper one of a node and the lower one of another.
@@ -204,9 +202,9 @@ def _halves(parts: Tensor, means: bool) -> list[Tensor]:
 
 
 def _quarters(parts: Tensor, means: bool) -> list[Tensor]:
-    """Return the same of nodes of 4 x 4 parts that begin at every second part or next.
+    """Return the same for nodes of 4 x 4 parts that begin at every second part or the one after.
 
-    In rows of two by two nodes: at (0, 0), (1, 3), (2, 1) and (3, 2), where half a node is 2.
+    A block of 2 x 2 nodes begins at (0, 0), (1, 3), (2, 1) and (3, 2), where half a node is 2.
     """
     height, width = ((side + 1) // 2 for side in parts.shape[-2:])
     rows, columns = (height + 1) // 2, (width + 1) // 2
@@ -229,7 +227,7 @@ def _quarters(parts: Tensor, means: bool) -> list[Tensor]:
 
 
 def _two_by_two(one: Tensor, right: Tensor, below: Tensor, across: Tensor) -> Tensor:
-    """Return (..., 2 h, 2 w) with each of four planes at one place of two by two."""
+    """Return (..., 2 h, 2 w) with each of four planes at one place of every 2x2."""
     return interleaved(interleaved(one, right, -1), interleaved(below, across, -1), -2)
 
 
@@ -239,9 +237,9 @@ def _peaks(level_from_finest: int) -> tuple[tuple[float, float], ...]:
 
     d1 and d2 are tuned to gratings along their own axis, and there to what `Haar.peak` gives. d3 is
     the wavelet in both directions, so its best grating is a diagonal one of sqrt(2) times the
-    frequency. Its gain is such that a diagonal grating of the frequency f of d1 and d2 is as strong
-    in the sum over the three, of EXPONENT, as a vertical one: with W and L what the wavelet and the
-    window leave of f / sqrt(2), and g of f, 2 (W L / g)^4 + (W^2 / gain)^4 = 1.
+    frequency. Its gain makes a diagonal grating of the frequency f of d1 and d2 as strong as a
+    vertical one in the sum over all three with EXPONENT: 2 (W L / g)^4 + (W^2 / gain)^4 = 1, where
+    W and L are the gains of the wavelet and the window at f / sqrt(2), and g is that at f.
     """
     frequency, gain = Haar().peak(level_from_finest)
     half = 2**level_from_finest

@@ -16,11 +16,11 @@ from torch_vdm.model.grid import PAPERS, Grid
 from torch_vdm.model.interleave import interleaved
 from torch_vdm.model.steps import PLAIN, Steps
 
-# The image half-way between its pixels, which the finest level needs: a sinc of so many taps on
-# either side, under a Hann window. Status: choice.
+# Taps on either side of the sinc, under a Hann window, that gives the image half-way between its
+# pixels, which the finest level needs. Status: choice.
 HALFWAY = 8
 
-# Planes with more numbers are filtered in bands of rows, which stay in the processor's cache.
+# Planes with more elements are filtered in bands of rows, which stay in the processor's cache.
 # Status: choice, measured.
 LARGEST_AT_ONCE = 2**17
 
@@ -28,7 +28,7 @@ _PLACES = [tap + 0.5 for tap in range(HALFWAY)]
 _SINC = [
     math.sin(math.pi * x) / x * (1.0 + math.cos(math.pi * x / (HALFWAY + 0.5))) for x in _PLACES
 ]
-# Of the pairs of pixels around the place, the nearest first; their sum is a half.
+# Weights of the pairs of pixels around the place, the nearest first; their sum is a half.
 WEIGHTS = tuple(0.5 * weight / sum(_SINC) for weight in _SINC)
 
 
@@ -38,26 +38,26 @@ class Peak(NamedTuple):
     frequency: float
     """Cycles/pixel."""
     even: float
-    """What the level's band and even filter leave of a grating there."""
+    """The gain of the level's band and even filter for a grating there."""
     odd: float
-    """The same of the odd filter."""
+    """The same for the odd filter."""
 
 
 @dataclass(frozen=True)
 class Steerable:
     """Even and odd filters at 0, 45, 90 and 135 degrees on every band of a pyramid.
 
-    A band is a plane of the Gaussian pyramid less its own lowpass, taken before any sample is
-    dropped, so that it has no aliases of its own. It is filtered by the pairs of
-    `torch_vdm.model.cortex.oriented` on a grid twice as dense as its level, the finest between
-    the image's pixels, and every second place is kept: nodes at the places of `StationaryHaar`,
-    10.7 times the coefficients of `Haar`.
+    A band is a plane of the Gaussian pyramid minus its own lowpass, taken before any sample is
+    dropped, so that it has no aliasing of its own. It is filtered by the pairs of
+    `torch_vdm.model.cortex.oriented` on a grid twice as dense as its level, for the finest level
+    between the image's pixels, and every second place is kept. The nodes lie where those of
+    `StationaryHaar` do, with 10.7 times the coefficients of `Haar`.
 
     Even and odd responses are kept apart, with their signs: the two images are compared by the
-    length of the difference of their pairs, which no phase changes.
+    length of the difference of their pairs, which does not depend on phase.
     """
 
-    # Its bands are narrow: no level sees gratings of other levels.
+    # Its bands are narrow: no level responds to gratings of other levels.
     csf: ClassVar[CSF] = "levels"
     shifts = 2
     phases = 2
@@ -66,7 +66,7 @@ class Steerable:
     _peaks: tuple[Peak, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Find the peaks once: a graph of torch.compile takes them as they are."""
+        """Find the peaks once: a graph of torch.compile takes them as constants."""
         object.__setattr__(self, "_peaks", tuple(_peak(level) for level in range(DEEPEST)))
 
     def grid(self, size: tuple[int, int], true_means: bool) -> Grid:  # noqa: ARG002
@@ -89,8 +89,8 @@ class Steerable:
         -------
         Cortex
             ``details[l]`` is (B, C, 8, h, w): for 0, 45, 90 and 135 degrees the even and the odd
-            response, each 1 at a level's best frequency for a grating of amplitude 1. Sizes as of
-            `StationaryHaar`.
+            response, each 1 at a level's best frequency for a grating of amplitude 1. Sizes are
+            those of `StationaryHaar`.
         """
         mean = mean_of(planes)
         band = _doubled(_doubled(planes, -1), -2)
@@ -105,7 +105,7 @@ class Steerable:
         *,
         grid: Grid | None = None,  # noqa: ARG002  # as `grid`
     ) -> tuple[Cortex, Tensor]:
-        """Return the finest levels, and what `rest` goes on from; see `Transform.begin`."""
+        """Return the finest levels, and what `rest` continues from; see `Transform.begin`."""
         band = _doubled(_doubled(planes, -1), -2)
         none = planes[..., :1, :1]
         cortex = self._cortex(planes, band - blur(band, steps), 0, none, steps, count)
@@ -124,7 +124,7 @@ class Steerable:
         *,
         grid: Grid | None = None,  # noqa: ARG002  # as `grid`
     ) -> Tensor:
-        """Return the Gaussian pyramid's plane; arguments as `decompose`."""
+        """Return the Gaussian pyramid's plane; arguments as in `decompose`."""
         for _ in range(octaves):
             planes = _dropped(blur(planes, steps))
         return planes
@@ -149,17 +149,17 @@ class Steerable:
         steps: Steps,
         count: int = DEEPEST,
     ) -> Cortex:
-        """Return the levels from ``finest`` on, of its plane and the band that it is made of.
+        """Return the levels from ``finest`` on, from its plane and the band that it is made from.
 
-        At most ``count``.
+        There are at most ``count``.
         """
         details: list[Tensor] = []
         lowpass: list[Tensor] = []
         all_levels = (max(plane.shape[-2:]) - 1).bit_length()
         for level in range(finest, finest + min(all_levels, count)):
             size = (plane.shape[-2], plane.shape[-1])
-            # The nodes lie between those of the next finer level: at the odd ones of the doubled
-            # image, the even ones but the first of all others.
+            # The nodes lie between those of the next finer level: at the odd samples of the doubled
+            # image, or at the even samples except the first on all other levels.
             peak = self._peaks[level]
             details.append(_responses(band, size, 1 if level == 0 else 2, peak, steps))
             smooth = blur(plane, steps)
@@ -173,7 +173,7 @@ class Steerable:
 
 
 def _doubled(plane: Tensor, dim: int) -> Tensor:
-    """Return a plane with, after every sample along ``dim``, one half-way to the next."""
+    """Return a plane with one sample inserted half-way after every sample along ``dim``."""
     sides = (HALFWAY - 1, HALFWAY, 0, 0) if dim == -1 else (0, 0, HALFWAY - 1, HALFWAY)
     padded = functional.pad(plane, sides, mode="replicate")
     length = plane.shape[dim]
@@ -190,7 +190,7 @@ def _dropped(plane: Tensor) -> Tensor:
 
 
 def _next(plane: Tensor) -> Tensor:
-    """Return a plane whose samples are those of the next row and column."""
+    """Return a plane shifted by one, so that each sample is that of the next row and column."""
     padded = functional.pad(plane, (0, 1, 0, 1), mode="replicate")
     return padded[..., 1:, 1:].contiguous()
 
@@ -220,12 +220,12 @@ def _paired(rows: tuple[Tensor, ...], even: float, odd: float) -> Tensor:
 
 @lru_cache
 def _peak(level_from_finest: int) -> Peak:
-    """Maximise what the pyramid and the even filter leave of a grating along a row.
+    """Maximise the gain of the pyramid and the even filter for a grating along a row.
 
-    Between 1/4 and 4 times the frequency at which the filter alone is best, a quarter of a cycle a
-    sample or so, there is one maximum. What aliases is not counted.
+    Between 1/4 and 4 times the frequency at which the filter alone is best, about a quarter of a
+    cycle per sample, there is one maximum. Aliasing is not counted.
     """
-    samples = 0.5 * 2.0**level_from_finest  # of the band, per cycle/pixel
+    samples = 0.5 * 2.0**level_from_finest  # cycles/sample of the band per cycle/pixel
 
     def band(frequency: float) -> float:
         if level_from_finest == 0:

@@ -1,4 +1,4 @@
-"""What every cortex transform is held to."""
+"""The interface of every cortex transform."""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
@@ -11,7 +11,7 @@ from torch_vdm.model.steps import PLAIN, Steps
 from torch_vdm.options import choice
 from torch_vdm.precision import widest
 
-# Levels that constants are made for: an image of 2^24 pixels a side.
+# The number of levels that constants are made for: an image of 2^24 pixels a side.
 DEEPEST = 24
 
 # Where contrast sensitivity acts: on the levels of a transform, or on the image before it.
@@ -19,7 +19,7 @@ CSF = Literal["levels", "filter"]
 
 
 def checked_csf(csf: str) -> None:
-    """Raise ValueError where ``csf`` is none of the two."""
+    """Raise ValueError if ``csf`` is neither of the two."""
     choice("csf", csf, get_args(CSF))
 
 
@@ -29,23 +29,23 @@ class Cortex(NamedTuple):
     Attributes
     ----------
     details
-        One tensor a level, (B, cones, orientations, h, w): the detail coefficients.
+        One tensor per level, (B, cones, orientations, h, w): the detail coefficients.
     lowpass
-        One tensor a level, (B, cones, h, w): the lowpass coefficients of the same nodes. An
-        image of one pixel has no details and one lowpass, itself. Of a filtered image, in which
-        nothing is adapted to them any more, a transform may leave them out.
+        One tensor per level, (B, cones, h, w): the lowpass coefficients of the same nodes. An
+        image of one pixel has no details and one lowpass, itself. For a filtered image, where
+        nothing is adapted to them any more, a transform may leave these out.
     mean
-        (B, cones, 1, 1), the mean of the image. Not the root's lowpass, in which the repeated
-        border of an odd side may count for more than it is.
+        (B, cones, 1, 1), the mean of the image. This is not the root's lowpass, in which the
+        repeated border of an odd side may count for too much.
     finest
         How many levels finer than these the image has; see `Transform.resume`.
     items
-        How many images lie below one another in every plane; where there are several, B is 1.
+        How many images are stacked vertically in every plane; if there are several, B is 1.
     grid
         Where the nodes lie on the image.
     windows
-        One tensor a level, (B, cones, h, w): the means of all that the nodes' details are made of,
-        to which the eye is adapted one level down. None where this is their lowpass.
+        One tensor per level, (B, cones, h, w): the means of all that the nodes' details are
+        computed from. The eye is adapted to them one level down. None if they are the lowpass.
     """
 
     details: tuple[Tensor, ...]
@@ -58,15 +58,15 @@ class Cortex(NamedTuple):
 
     @property
     def before(self) -> tuple[Before, ...]:
-        """What is put before the first node of each level where it has its parents."""
+        """How many nodes are put before the first of each level to find their parents."""
         return self.grid.down(len(self.details), self.finest)
 
     def parent_lowpass(self, level: int) -> Tensor:
-        """Return the lowpass one level up from ``level``, of windows; the root's is its own."""
+        """Return the lowpass of windows one level up from ``level``; the root's is its own."""
         return (self.windows or self.lowpass)[max(level - 1, 0)]
 
     def each(self, function: Callable[..., Tensor], *others: "Cortex") -> "Cortex":
-        """Return the representation with every plane as a function makes it, of the others' too."""
+        """Return the representation with a function applied to every plane and those of others."""
         all_of = (self, *others)
 
         def of_levels(*planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
@@ -107,11 +107,11 @@ class Transform(Protocol):
 
     @property
     def shifts(self) -> int:
-        """How many nodes a level has, in x and in y, in the width of one.
+        """How many nodes a level has per node width, in x and in y: its oversampling.
 
         1: nodes lie side by side, the finest 2 pixels wide, and the quad-tree is the paper's. 2:
-        they overlap, and the quad-tree is that of the halves of nodes, whose leaves are the pixels.
-        The half of a node (y, x) is covered by the nodes y - 1 and y, x - 1 and x.
+        they overlap, and the quad-tree is that of half nodes, whose leaves are the pixels. The
+        half node (y, x) is covered by the nodes y - 1 and y, x - 1 and x.
         """
 
     @property
@@ -119,8 +119,8 @@ class Transform(Protocol):
         """Where contrast sensitivity acts.
 
         "levels": on the details, at each level's frequency. "filter": on the image, at every
-        frequency; what is decomposed is then no light but weighted contrast, A, C1 and C2 for the
-        cones, and a level only divides it by its gains.
+        frequency; what is decomposed is then not light but weighted contrast, A, C1 and C2 in place
+        of the cones, and a level only divides it by its gains.
         """
 
     @property
@@ -129,16 +129,15 @@ class Transform(Protocol):
 
     @property
     def reach(self) -> int:
-        """How many nodes around a node, to each side, hold all that it and its parent are made of.
+        """The radius, in nodes of its own level, of all that a node and its parent depend on.
 
-        Nodes of its own level; what lies further off changes neither its details nor its parent's
-        lowpass.
+        What lies further away changes neither its details nor its parent's lowpass.
         """
 
     def grid(self, size: tuple[int, int], true_means: bool) -> Grid:
         """Return where the nodes lie on an image of ``size``, for parents and for paths.
 
-        With ``true_means`` as `decompose` takes it.
+        ``true_means`` is as in `decompose`.
         """
 
     def decompose(
@@ -151,7 +150,7 @@ class Transform(Protocol):
     ) -> Cortex:
         """Decompose (B, C, H, W) to the coarsest level, step by step.
 
-        ``true_means``: no pixel counts for more than another, at the border of an odd side too.
+        ``true_means``: no pixel counts for more than another, even at the border of an odd side.
         ``grid``: that of a part of an image, a `Grid.part`; by default that of an image of this
         size.
         """
@@ -170,7 +169,8 @@ class Transform(Protocol):
     def resume(self, base: Base, steps: Steps = PLAIN, true_means: bool = False) -> Cortex:
         """Return the levels of `decompose` without its ``base.octaves`` + 1 finest.
 
-        From what `reduced` gives, so that an image larger than memory is decomposed in tiles.
+        It starts from what `reduced` gives, so that an image larger than memory can be decomposed
+        in tiles.
         """
 
     def begin(
@@ -184,30 +184,30 @@ class Transform(Protocol):
     ) -> tuple[Cortex, Tensor]:
         """Return the ``count`` finest levels of `decompose`, 3 or more, and what `rest` needs.
 
-        That is the image at 1 / 2^(count - shifts) of its sides. So a large image is decomposed in
-        strips; a strip's mean is none.
+        That is the image at 1 / 2^(count - shifts) of its sides. This is how a large image is
+        decomposed in strips; the mean of a strip is a placeholder.
         """
 
     def rest(self, base: Base, steps: Steps = PLAIN, true_means: bool = False) -> Cortex:
         """Return the levels of `decompose` without its ``count`` - 1 finest.
 
-        The plane of ``base`` is put together from those that `begin` gives of all strips.
+        The plane of ``base`` is joined from those that `begin` gives for all strips.
         """
 
     def peaks(self, level_from_finest: int) -> tuple[tuple[float, float], ...]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there.
 
-        For each orientation, or one for all of them.
+        There is one pair for each orientation, or one for all of them.
         """
 
 
 def mean_of(planes: Tensor, items: int = 1) -> Tensor:
-    """Return the mean of (B, C, H, W), (B, C, 1, 1), good to its last bit in any size.
+    """Return the mean (B, C, 1, 1) of (B, C, H, W), good to its last bit at any size.
 
-    Of ``items`` images below one another, (1, C, items H, W), that of each, (1, C, items, 1).
+    For ``items`` images stacked vertically, (1, C, items H, W), that of each, (1, C, items, 1).
 
-    The lowpass term takes the difference of two of them, 76 times and more: the rounding of a sum
-    over millions of pixels would be seen.
+    The lowpass term multiplies the difference of two means by 76 and more: the rounding of a sum
+    over millions of pixels would be visible.
     """
     rows = planes.mean(-1, keepdim=True).to(widest(planes.device))
     if items > 1:
