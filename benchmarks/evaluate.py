@@ -460,7 +460,7 @@ def _plot(result: dict[str, Any], path: Path) -> None:
     right.plot(frames, [row["peak_bytes"] / 1e6 for row in result["many"]], marker="o")
     right.set(xlabel="frames", ylabel="peak memory, MB", xscale="log")
     for axis in (left, right):
-        axis.set_ylim(bottom=0.0)
+        axis.set_ylim(0.0, 1.1 * axis.dataLim.y1)
         axis.spines[["top", "right"]].set_visible(False)
     left.legend(frameon=False)
     figure.savefig(path)

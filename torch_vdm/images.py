@@ -82,7 +82,7 @@ def require_finite(name: str, image: Tensor, origin: tuple[int, int, int]) -> No
 
 
 def range_of(image: Tensor) -> Tensor:
-    """Return the lowest and the highest value of an image, and the share of those below 0."""
+    """Return an image's lowest and highest value, and the share of those below `LOWEST_CODE`."""
     image = image.detach()
     below = (image < LOWEST_CODE).to(image).mean()
     return torch.stack([image.amin(), image.amax(), below])

@@ -24,9 +24,10 @@ Reduction = Literal["mean", "sum", "none"]
 L1 = 360.0
 
 
-# The dark light of the loss's observer, cd/m2: as of a screen in a lit room, a hundred times the
-# eye's own. A step away from black then has no contrast of hundreds: 300 steps of Adam lead from
-# black to the picture with the metric alone; with 0.02 they do not. Status: choice, measured.
+# The dark light of the loss's observer, cd/m2: as of a screen in a lit room, several hundred
+# times the eye's own. A step away from black then has no contrast of hundreds: 300 steps of Adam
+# lead from black to the picture with the metric alone; with 0.02 they do not. Status: choice,
+# measured.
 DARK_LIGHT = 0.2
 
 
@@ -53,9 +54,9 @@ class VDMLoss(operators.Enrolled):
     Parameters
     ----------
     ppd, display, options
-        As in `VDM`, except that the default observer is the calibrated one in a lit room, with a
-        hundred times its dark light, and called "lit room": otherwise a step away from black could
-        be seen at any contrast.
+        As in `VDM`, except that the default observer is the calibrated one in a lit room, with
+        several hundred times its dark light, and called "lit room": otherwise a step away from
+        black could be seen at any contrast.
     l1
         Weight of the L1 term; 0: the metric alone.
     reduction
