@@ -287,6 +287,8 @@ def _rendered(views: Views, options: argparse.Namespace) -> Done:
     record = options.output.with_suffix(".json")
     known = _known(record, options)
     if known is not None:
+        # A worker may have died between writing the record and deleting the checkpoint.
+        _delete_kept(options)
         return Done(known, stood=True)
     # It belongs to another picture, which this one overwrites.
     record.unlink(missing_ok=True)
@@ -298,8 +300,7 @@ def _rendered(views: Views, options: argparse.Namespace) -> Done:
         if not kept:
             raise
         # It has other settings, or two workers wrote it at once.
-        for path in kept:
-            path.unlink(missing_ok=True)
+        _delete_kept(options)
         options.resume = False
         told = views(options)
     for figures in told:
@@ -307,8 +308,7 @@ def _rendered(views: Views, options: argparse.Namespace) -> Done:
     key = _key(options, *(told[0][name] for name in ("mitsuba", "variant", "fingerprint")))
     with atomic_path(record) as temporary:
         temporary.write_text(json.dumps({"key": key, "views": told}, indent=1) + "\n")
-    for path in _kept(options):
-        path.unlink(missing_ok=True)
+    _delete_kept(options)
     return Done(told)
 
 
@@ -352,6 +352,11 @@ def _kept(options: argparse.Namespace) -> list[Path]:
     names = (f"{checkpoint.stem}.{number}{checkpoint.suffix}" for number in count())
     views = takewhile(Path.is_file, map(checkpoint.with_name, names))
     return [path for path in (checkpoint, *views) if path.is_file()]
+
+
+def _delete_kept(options: argparse.Namespace) -> None:
+    for path in _kept(options):
+        path.unlink(missing_ok=True)
 
 
 def _all(folder: Path, pictures: list[Picture], failed: dict[Picture, str]) -> str:

@@ -112,7 +112,11 @@ def test_what_is_done_stands_and_what_changed_is_done_again(
     moved = out.rename(tmp_path / "moved")
     words[words.index(str(out))] = str(moved)
     out = moved
+    # A worker that dies after its record leaves the checkpoint.
+    left = out / "lamp.checkpoint"
+    left.write_bytes(b"")
     assert main([*words, "--resume", "--json", "-"]) == 0
+    assert not left.exists()
     told = json.loads(capsys.readouterr().out)
     assert [[Path(view["scene"]).name for view in views] for views in told] == [
         ["lamp.xml"],
