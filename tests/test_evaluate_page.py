@@ -231,6 +231,29 @@ def test_panes_move_together(page: Any) -> None:
     press(page, "v")
 
 
+def test_another_size_of_the_window_shows_the_same_place(page: Any) -> None:
+    open_frame(page, 0)
+
+    def resize(width: int) -> None:
+        metrics = {"width": width, "height": 700, "deviceScaleFactor": 1, "mobile": False}
+        page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+        wait(page, f"innerWidth === {width} && painted()")
+
+    try:
+        resize(1000)
+        fitting = "fittingScale(panes()[0].clientWidth, panes()[0].clientHeight)"
+        assert value(page, "view.transform.k") == pytest.approx(value(page, fitting))
+        press(page, "++")
+        drag(page, 0, -50)
+        wait(page, "painted()")
+        before, scale = middle(page), value(page, "view.transform.k")
+        resize(620)
+        assert middle(page) == pytest.approx(before, abs=0.5)
+        assert value(page, "view.transform.k") == pytest.approx(scale)
+    finally:
+        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
 def colour(page: Any, x: int, y: int) -> list[int]:
     data = f"panes()[0].getContext('2d').getImageData({x}, {y}, 1, 1).data"
     return list(value(page, f"[...{data}].slice(0, 3)"))

@@ -121,7 +121,7 @@ $("top").addEventListener("change", () => {
   if (top > 0 && Number.isFinite(top)) { view.top = top; showScale(); draw(); }
 });
 for (const [key, what] of [...KEYS, ...MORE_KEYS]) $("help").querySelector("dl").append(element("dt", key), element("dd", what));
-addEventListener("resize", () => { if (view.row && !$("frame").hidden) { resize(); draw(); } });
+addEventListener("resize", () => { if (view.row && !$("frame").hidden) resized(); });
 addEventListener("hashchange", follow);
 
 showVerdicts();

@@ -37,6 +37,22 @@ function resize() {
   }
 }
 
+// The window has another size: what was fitted is, and what lay in the middle stays there.
+function resized() {
+  const before = panes()[0], size = [before.width / devicePixelRatio, before.height / devicePixelRatio];
+  const { k } = view.transform, fitted = Math.abs(k / fittingScale(...size) - 1) < 0.01;
+  const [x, y] = view.transform.invert(size.map((side) => side / 2));
+  resize();
+  const { clientWidth, clientHeight } = panes()[0];
+  if (fitted) fit();
+  else first().call(zoom.transform, d3.zoomIdentity.translate(clientWidth / 2, clientHeight / 2).scale(k).translate(-x, -y));
+}
+
+function fittingScale(width, height) {
+  const picture = pictureSize();
+  return Math.min(width / picture.width, height / picture.height);
+}
+
 function pictureSize() {
   const { row } = view;
   return { width: Math.ceil(row.width / row.block), height: Math.ceil(row.height / row.block) };
@@ -54,7 +70,7 @@ function fit() {
   const { width, height } = pictureSize();
   const { clientWidth, clientHeight } = panes()[0];
   zoom.translateExtent([[0, 0], [width, height]]);
-  zoom.scaleExtent([Math.min(1, clientWidth / width, clientHeight / height) / 2, 64]);
+  zoom.scaleExtent([Math.min(1, fittingScale(clientWidth, clientHeight)) / 2, 64]);
   show(0, 0, width, height);
 }
 
@@ -108,6 +124,7 @@ function showFrame(row, at) {
   showScale();
   showFigures();
   showHistogram();
+  if (same && view.drawn) resized(); // it may have been while the summary was shown
   layPanes();
   if (!same || !view.drawn) fit();
   if (at) goTo(at);
