@@ -231,25 +231,73 @@ def test_panes_move_together(page: Any) -> None:
     press(page, "v")
 
 
+@pytest.mark.parametrize("at", ["60,0,30,30", "0,0,16,16", "74,44,16,16"])
+def test_a_region_does_not_jump_at_the_next_gesture(page: Any, at: str) -> None:
+    page.execute_script("location.hash = arguments[0]", f"#0/{at}")
+    wait(page, "view.row?.number === 0 && painted()")
+    point(page, 300, 100)
+    before = value(page, "view.transform.invert([300, 100])")
+    page.execute_script(
+        """const box = panes()[0].getBoundingClientRect();
+        panes()[0].dispatchEvent(new WheelEvent("wheel", {deltaY: -50, clientX: box.left + 300,
+          clientY: box.top + 100, cancelable: true}))"""
+    )
+    wait(page, "painted()")
+    moved = 2.0 ** (0.002 * 50) * HEIGHT / value(page, "view.transform.k")
+    assert value(page, "view.transform.invert([300, 100])") == pytest.approx(before, abs=moved)
+
+
+def test_what_is_no_region_and_the_skip_link_are_no_harm(page: Any) -> None:
+    open_frame(page, 0)
+    for at in ("10,10,0,0", "0,0,0,0", ",,,", "99999,99999,5,5"):
+        page.execute_script("location.hash = arguments[0]", f"#0/{at}")
+        wait(page, f"location.hash.endsWith('{at}') && painted()")
+        assert value(page, "Number.isFinite(view.transform.k)"), at
+        assert value(page, "region") is None
+    page.execute_script("location.hash = '#main'")
+    wait(page, "painted()")
+    assert not value(page, "$('frame').hidden")
+
+
+def test_the_value_stays_that_under_the_pointer(page: Any) -> None:
+    open_frame(page, 0)
+    point(page, 300, 150)
+    press(page, "++")
+    wait(page, "painted()")
+    x, y = value(page, "view.transform.invert([300, 150]).map(Math.floor)")
+    assert value(page, "$('value').textContent").startswith(f"x {x}, y {y}:")
+
+
 def test_another_size_of_the_window_shows_the_same_place(page: Any) -> None:
     open_frame(page, 0)
 
-    def resize(width: int) -> None:
-        metrics = {"width": width, "height": 700, "deviceScaleFactor": 1, "mobile": False}
+    def resize(width: int, ratio: float = 1.0) -> None:
+        metrics = {"width": width, "height": 700, "deviceScaleFactor": ratio, "mobile": False}
         page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
-        wait(page, f"innerWidth === {width} && painted()")
+        settled = "String(paneSize()) === String(view.size) && painted()"
+        wait(page, f"innerWidth === {width} && devicePixelRatio === {ratio} && {settled}")
 
     try:
         resize(1000)
-        fitting = "fittingScale(panes()[0].clientWidth, panes()[0].clientHeight)"
+        fitting = "fittingScale(paneSize())"
         assert value(page, "view.transform.k") == pytest.approx(value(page, fitting))
+        # The browser's own zoom.
+        resize(800, 1.25)
+        assert value(page, "view.transform.k") == pytest.approx(value(page, fitting))
+        assert middle(page) == pytest.approx([WIDTH / 2, HEIGHT / 2])
         press(page, "++")
         drag(page, 0, -50)
         wait(page, "painted()")
         before, scale = middle(page), value(page, "view.transform.k")
-        resize(620)
-        assert middle(page) == pytest.approx(before, abs=0.5)
-        assert value(page, "view.transform.k") == pytest.approx(scale)
+        for size in ((620, 1.0), (500, 2.0), (800, 1.25)):
+            resize(*size)
+            assert middle(page) == pytest.approx(before, abs=0.5)
+            assert value(page, "view.transform.k") == pytest.approx(scale)
+        # What has had no room begins anew.
+        resize(20)
+        resize(800, 1.25)
+        assert value(page, "view.transform.k") == pytest.approx(value(page, fitting))
+        assert value(page, "panes()[0].width") == round(1.25 * value(page, "view.size[0]"))
     finally:
         page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 

@@ -13,16 +13,21 @@ function showSummary() {
 }
 
 function follow() {
+  if (location.hash === "#main") return; // past the head of the page
   const [, number, at] = /^#(\d+)(?:\/([\d,]+))?$/.exec(location.hash) || [];
   const row = rows[number];
   if (!row) { showSummary(); return; }
   const numbers = at ? at.split(",").map(Number) : [];
-  showFrame(row, numbers.length === 4 ? numbers : null);
+  const [left, top, width, height] = numbers;
+  const there = numbers.length === 4 && left < row.width && top < row.height && width > 0 && height > 0;
+  showFrame(row, there ? numbers : null);
 }
 
 function step(by) {
   const here = order.rows.indexOf(view.row);
-  const next = order.rows[(here + by + order.rows.length) % order.rows.length];
+  // One that the table does not show lies before its first row.
+  const from = here < 0 && by < 0 ? 0 : here;
+  const next = order.rows[(from + by + order.rows.length) % order.rows.length];
   if (next) open(next);
 }
 
@@ -40,6 +45,8 @@ function toggleMap() {
 
 function setMode(mode) {
   $("mode").value = mode;
+  if (document.activeElement === $("slider")) $("panes").focus();
+  view.pointer = null; // its pane may be gone
   layPanes();
   fit();
 }
@@ -89,7 +96,7 @@ document.addEventListener("keydown", (event) => {
   if (event.target === $("panes") && MOVES[event.key]) {
     event.preventDefault();
     // A tenth of the view; with shift one pixel of the picture.
-    const size = event.shiftKey ? 1 : panes()[0].clientWidth / 10 / view.transform.k;
+    const size = event.shiftKey ? 1 : view.size[0] / 10 / view.transform.k;
     view.pointer = null;
     first().call(zoom.translateBy, ...MOVES[event.key].map((way) => way * size));
     return;
@@ -100,7 +107,7 @@ document.addEventListener("keydown", (event) => {
 
 const CLICKS = {
   "to-summary": () => { location.hash = ""; },
-  "to-frame": () => { const row = view.row || order.rows[0]; if (row) open(row); },
+  "to-frame": () => { const row = view.row || order.rows[0] || rows[0]; if (row) open(row); },
   previous: () => step(-1),
   next: () => step(1),
   in: () => zoomBy(1.5),
@@ -119,9 +126,15 @@ $("slider").addEventListener("input", () => setSlider($("slider").value / 1000))
 $("top").addEventListener("change", () => {
   const top = Number($("top").value);
   if (top > 0 && Number.isFinite(top)) { view.top = top; showScale(); draw(); }
+  $("top").value = view.top;
 });
 for (const [key, what] of [...KEYS, ...MORE_KEYS]) $("help").querySelector("dl").append(element("dt", key), element("dd", what));
-addEventListener("resize", () => { if (view.row && !$("frame").hidden) resized(); });
+$("slider").addEventListener("wheel", (event) => {
+  event.preventDefault();
+  panes()[0].dispatchEvent(new WheelEvent("wheel", event));
+}, { passive: false });
+addEventListener("resize", resized);
+new ResizeObserver(resized).observe($("panes"));
 addEventListener("hashchange", follow);
 
 showVerdicts();

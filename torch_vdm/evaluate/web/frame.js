@@ -1,7 +1,7 @@
 // One frame: its pictures under one zoom, what is told of it, and the plot of its map.
 
 // `transform`: of the picture's pixels into those of a pane (d3-zoom).
-const view = { row: null, transform: d3.zoomIdentity, stops: 0, top: 2, slider: 0.5, pointer: null, drawn: false };
+const view = { row: null, transform: d3.zoomIdentity, stops: 0, top: 2, slider: 0.5, size: [0, 0], pointer: null, drawn: false };
 let region = null;
 
 // A pane shows a layer, or under the slider the left and the right one; all move together.
@@ -19,7 +19,7 @@ function layPanes() {
   d3.select("#panes").classed("side", !sliding()).selectAll("figure").data(shown, String).join((entering) => {
     const figure = entering.insert("figure", "input");
     figure.append("canvas").attr("role", "img").call(zoom).on("dblclick.zoom", null).on("dblclick", fit)
-      .on("pointermove", (event) => { point(view.transform.invert(d3.pointer(event))); })
+      .on("pointermove", (event) => point(d3.pointer(event)))
       .on("pointerleave", () => point(null));
     figure.selectAll("figcaption").data((names) => names).join("figcaption");
     return figure;
@@ -32,52 +32,57 @@ function layPanes() {
 function resize() {
   for (const pane of panes()) {
     pane.style.aspectRatio = `${view.row.width}/${view.row.height}`;
-    pane.width = Math.max(1, Math.round(pane.clientWidth * devicePixelRatio));
-    pane.height = Math.max(1, Math.round(pane.clientHeight * devicePixelRatio));
+    const sides = [pane.clientWidth, pane.clientHeight].map((side) => Math.max(1, Math.round(side * devicePixelRatio)));
+    if (pane.width !== sides[0] || pane.height !== sides[1]) [pane.width, pane.height] = sides;
   }
+  view.size = paneSize();
 }
 
-// The window has another size: what was fitted is, and what lay in the middle stays there.
+// The panes may have another size: what was fitted is fitted, and what lay in the middle stays there.
 function resized() {
-  const before = panes()[0], size = [before.width / devicePixelRatio, before.height / devicePixelRatio];
-  const { k } = view.transform, fitted = Math.abs(k / fittingScale(...size) - 1) < 0.01;
-  const [x, y] = view.transform.invert(size.map((side) => side / 2));
+  if (!view.row || $("frame").hidden) return;
+  const before = view.size, { k } = view.transform;
   resize();
-  const { clientWidth, clientHeight } = panes()[0];
-  if (fitted) fit();
-  else first().call(zoom.transform, d3.zoomIdentity.translate(clientWidth / 2, clientHeight / 2).scale(k).translate(-x, -y));
+  if (Math.min(...before) > 0 && Math.abs(k / fittingScale(before) - 1) > 0.01) {
+    centre(k, ...view.transform.invert(before.map((side) => side / 2)));
+  } else fit();
 }
 
-function fittingScale(width, height) {
-  const picture = pictureSize();
-  return Math.min(width / picture.width, height / picture.height);
-}
+const paneSize = () => [panes()[0].clientWidth, panes()[0].clientHeight];
 
 function pictureSize() {
   const { row } = view;
-  return { width: Math.ceil(row.width / row.block), height: Math.ceil(row.height / row.block) };
+  return [Math.ceil(row.width / row.block), Math.ceil(row.height / row.block)];
 }
 
-// Shows a part of the picture, in its pixels, as large as it goes.
-function show(left, top, width, height) {
-  const { clientWidth, clientHeight } = panes()[0];
-  const scale = Math.min(clientWidth / width, clientHeight / height);
-  const middle = d3.zoomIdentity.translate(clientWidth / 2, clientHeight / 2);
-  first().call(zoom.transform, middle.scale(scale).translate(-left - width / 2, -top - height / 2));
+const fittingScale = (size) => Math.min(...pictureSize().map((side, at) => size[at] / side));
+
+// The middle of a pane always shows a place of the picture, whatever moves it.
+function constrained(transform, [[left, top], [right, bottom]]) {
+  const middle = transform.invert([(left + right) / 2, (top + bottom) / 2]);
+  return transform.translate(...pictureSize().map((side, at) => middle[at] - Math.min(side, Math.max(0, middle[at]))));
+}
+zoom.constrain(constrained);
+
+// Shows a place of the picture, in its pixels, in the middle.
+function centre(scale, x, y) {
+  const [width, height] = view.size, fitting = fittingScale(view.size);
+  if (!(width > 0 && height > 0)) return;
+  zoom.scaleExtent([Math.min(1, fitting) / 2, Math.max(64, fitting)]);
+  const [least, most] = zoom.scaleExtent();
+  const moved = d3.zoomIdentity.translate(width / 2, height / 2).scale(Math.min(most, Math.max(least, scale))).translate(-x, -y);
+  first().call(zoom.transform, constrained(moved, [[0, 0], view.size]));
 }
 
 function fit() {
-  const { width, height } = pictureSize();
-  const { clientWidth, clientHeight } = panes()[0];
-  zoom.translateExtent([[0, 0], [width, height]]);
-  zoom.scaleExtent([Math.min(1, fittingScale(clientWidth, clientHeight)) / 2, 64]);
-  show(0, 0, width, height);
+  centre(fittingScale(view.size), ...pictureSize().map((side) => side / 2));
 }
 
 // A region and as much again on each side.
 function goTo(at) {
   const [left, top, width, height] = at.map((size) => size / view.row.block);
-  show(left - width, top - height, 3 * width, 3 * height);
+  const scale = Math.min(view.size[0] / width, view.size[1] / height) / 3;
+  centre(scale, left + width / 2, top + height / 2);
 }
 
 function layerNames() {
@@ -124,7 +129,7 @@ function showFrame(row, at) {
   showScale();
   showFigures();
   showHistogram();
-  if (same && view.drawn) resized(); // it may have been while the summary was shown
+  if (same && view.drawn) resized(); // the window may have another size since
   layPanes();
   if (!same || !view.drawn) fit();
   if (at) goTo(at);
@@ -186,12 +191,14 @@ function showScale() {
 
 let asked = 0;
 async function draw() {
+  if (String(paneSize()) !== String(view.size)) resized();
+  else resize(); // the screen may have other pixels
   const number = ++asked;
   $("panes").dataset.asked = number;
   const names = layerNames();
   const wanted = panes().map((pane) => [pane, sliding() ? [$("left").value, $("right").value] : d3.select(pane).datum()]);
   $("state").textContent = "";
-  const late = setTimeout(() => { $("state").textContent = "Loading pictures …"; }, 300);
+  const late = setTimeout(() => { if (number === asked) $("state").textContent = "Loading pictures …"; }, 300);
   try {
     const ready = await Promise.all(wanted.map(([, shown]) => Promise.all(shown.map((name) => layer(names[name])))));
     await unpacked(view.row.pictures[2]); // for the value under the pointer
@@ -201,7 +208,11 @@ async function draw() {
       $("panes").dataset.painted = number;
     }
   } catch (error) {
-    if (number === asked) { $("state").textContent = error.message; }
+    if (number === asked) {
+      for (const [pane, shown] of wanted) paint(pane, shown, []);
+      tell();
+      $("state").textContent = error.message;
+    }
   } finally {
     clearTimeout(late);
     if (number === asked && $("state").textContent.startsWith("Loading")) $("state").textContent = "";
@@ -243,17 +254,17 @@ function tell() {
   showValue();
 }
 
-// The place of the picture whose value is told; none: what lies in the middle.
+// The place of a pane whose value is told; none: its middle.
 function point(at) {
   view.pointer = at;
   showValue();
 }
 
 function showValue() {
-  const { clientWidth, clientHeight } = panes()[0];
-  const [x, y] = (view.pointer ?? view.transform.invert([clientWidth / 2, clientHeight / 2])).map(Math.floor);
+  const [x, y] = view.transform.invert(view.pointer ?? view.size.map((side) => side / 2)).map(Math.floor);
   const map = decoded.get(view.row.pictures[2]), block = view.row.block;
-  if (!map || x < 0 || y < 0 || x >= map.width || y >= map.height) { $("value").textContent = "outside the image"; return; }
+  if (!map) { $("value").textContent = ""; return; }
+  if (x < 0 || y < 0 || x >= map.width || y >= map.height) { $("value").textContent = "outside the image"; return; }
   const value = mapValue(map, y * map.width + x) / data.steps;
   const where = block === 1 ? `x ${x}, y ${y}` : `x ${x * block}, y ${y * block}, largest of ${block} x ${block}`;
   $("value").textContent = `${where}: ${value.toFixed(2)} JND`;

@@ -19,9 +19,13 @@ function arrived(name) {
   if (!arriving.has(name)) {
     const waiting = {};
     waiting.promise = new Promise((resolve, reject) => {
-      waiting.take = resolve;
+      let taken = false;
+      waiting.take = (picture) => { taken = true; resolve(picture); };
       const script = element("script", null, { src: `${place(data.pictures)}/${place(name)}.js` });
-      script.addEventListener("load", () => script.remove());
+      script.addEventListener("load", () => {
+        script.remove();
+        if (!taken) reject(new Error("A picture is damaged: write the report again with --resume after deleting it."));
+      });
       script.addEventListener("error", () => {
         script.remove();
         reject(new Error("A picture is missing: keep the folders beside the page."));
