@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -412,3 +413,30 @@ def test_a_picture_that_is_missing_is_told(page: Any, report: Path) -> None:
     wait(page, "$('state').textContent.includes('missing')")
     hidden.rename(path)
     page.get_log("browser")  # the browser says so too
+
+
+def test_a_picture_that_is_cut_off_is_told(page: Any, report: Path) -> None:
+    open_frame(page, 0)
+    path = report / "pictures" / f"{value(page, 'rows[2].pictures[0]')}.js"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    page.execute_script("location.hash = '#2'")
+    wait(page, "$('state').textContent.includes('damaged')")
+    path.write_bytes(whole)
+    assert "000" not in value(page, "panes()[0].getAttribute('aria-label')").split("frame")[1]
+    page.get_log("browser")  # the browser says so too
+
+
+def test_going_back_quickly_leaves_no_message(page: Any) -> None:
+    open_frame(page, 0)
+    page.execute_script(
+        """const before = arrived;
+        arrived = async (name) => {
+          await new Promise((resolve) => setTimeout(resolve, 700));
+          return before(name);
+        };
+        location.hash = "#6";
+        setTimeout(() => { location.hash = "#0"; }, 100)"""
+    )
+    time.sleep(1.5)
+    assert value(page, "[view.row.number, $('state').textContent]") == [0, ""]
