@@ -486,8 +486,7 @@ def fit(
     begin = np.log([start[name] for name in names])
     found = least_squares(evaluate, begin, jac=slopes, max_nfev=evaluations, xtol=1e-4, ftol=1e-5)
     covariance = np.linalg.inv(found.jac.T @ found.jac) * np.mean(found.fun**2)
-    values = {name: float(np.exp(value)) for name, value in zip(names, found.x, strict=True)}
-    return values, dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    return _values(found.x), dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
 
 
 def _slopes(seen: Seen, about: Array) -> Array:
@@ -504,7 +503,7 @@ def noise_of(observer: Observer, transform: Transform, every: int = ZONES) -> Se
         return _nothing_seen
 
     def noise(logs: Array) -> Array:
-        scores = zone_scores(_changed(observer, logs), transform, PPD, some)
+        scores = zone_scores(_changed(observer, _values(logs)), transform, PPD, some)
         return np.array([NOISE**0.5 * np.mean(DECIBELS * np.log(scores))])
 
     return noise
@@ -514,15 +513,19 @@ def likeness_of(observer: Observer, transform: Transform, some: list[Pair], aim:
     """Return what is seen of pairs, over what `reference` sees: its largest values, ``aim``."""
 
     def likeness(logs: Array) -> Array:
-        found = pictures.largest(_changed(observer, logs), transform, some)
+        found = pictures.largest(_changed(observer, _values(logs)), transform, some)
         weighted: Array = (LIKENESS / len(some)) ** 0.5 * DECIBELS * np.log(found / aim)
         return weighted
 
     return likeness
 
 
-def _changed(observer: Observer, logs: Array) -> Observer:
-    values: Any = dict(zip(FREE, np.exp(logs).tolist(), strict=True))
+def _values(logs: Array) -> dict[str, float]:
+    """Return the parameters from their logarithms."""
+    return dict(zip(FREE, np.exp(logs).tolist(), strict=True))
+
+
+def _changed(observer: Observer, values: dict[str, Any]) -> Observer:
     return dataclasses.replace(observer, **values)
 
 
@@ -708,8 +711,7 @@ def rung(
     values, deviations = fit(model, start, 6 if quick else 30, seen=noise)
     residual = predicted(model, values)
     discs_residual = predicted(Model(observer, discs, drawings, transform), values)
-    numbers: dict[str, Any] = {**values}
-    fitted = dataclasses.replace(observer, **numbers)
+    fitted = _changed(observer, values)
     result: dict[str, Any] = {
         "parameters": {
             name: {"value": values[name], "times_or_over": math.exp(deviations[name])}
@@ -750,11 +752,7 @@ class _Beside(NamedTuple):
 
 def beside_reference() -> tuple[_Beside, _Beside]:
     """Return the pairs that are fitted, and those that judge."""
-    generator = torch.Generator().manual_seed(1)
-    photos = [
-        [Pair(kind, test, photo) for kind, test in pictures.distorted(photo, generator).items()]
-        for photo in pictures.photographs(5).values()
-    ]
+    photos = list(pictures.of_photographs(pictures.PHOTOGRAPHS))
     renders = list(pictures.renders())
     cut = round(FITTED_RENDERS * len(renders))
     sides = (
@@ -789,8 +787,7 @@ def held(
     told = {}
     for name, parameters in (("alone", start), ("held", values)):
         residual = predicted(model, parameters)
-        logs = np.log([parameters[each] for each in FREE])
-        changed = _changed(observer, logs)
+        changed = _changed(observer, parameters)
         octaves = [
             np.log2(pictures.largest(changed, transform, side.pairs) / side.aim)
             for side in (fitted, judging)

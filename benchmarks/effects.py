@@ -143,9 +143,9 @@ def run(quick: bool, output: Path | None, part: str | None = None) -> None:
 def run_metric(quick: bool, output: Path | None) -> None:
     torch.set_num_threads(THREADS)
     size = QUICK if quick else SIZE
-    found = {}
+    found, taken = {}, pairs(size)
     with torch.no_grad():
-        for name, pair in pairs(size).items():
+        for name, pair in taken.items():
             found[name] = of_pair(pair, 1 if quick else ROUNDS)
     result = {**record.circumstances(), "size": list(size), "pairs": found}
     text = table(result)
@@ -153,7 +153,8 @@ def run_metric(quick: bool, output: Path | None) -> None:
     if output is not None:
         record.save(output, "effects", result, text)
         plot(result, output / "effects.png")
-        draw_way(pairs(size)["local edits"], output / "effects_plan.png")
+        if not quick:  # small images are computed whole
+            draw_way(taken["local edits"], output / "effects_plan.png")
 
 
 def draw_way(pair: Pair, path: Path) -> None:

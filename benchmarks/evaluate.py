@@ -114,11 +114,10 @@ def _pairs(folder: Path, count: int, height: int, width: int) -> None:
 def _process(folder: Path, output: str, *more: str) -> "subprocess.Popen[bytes]":
     """Start the command; each of its processes computes on one thread."""
     words = ["evaluate", f"--reference={folder}/reference", f"--test=A={folder}/test"]
-    # A warm start finds modules compiled; some machines are told not to keep them.
-    environment = {n: v for n, v in os.environ.items() if n != "PYTHONDONTWRITEBYTECODE"}
     return subprocess.Popen(
         [sys.executable, "-m", "torch_vdm", *words, f"--output={folder}/{output}", *more],
-        env=environment | {"OMP_NUM_THREADS": "1"},
+        # A warm start finds modules compiled; some machines are told not to keep them.
+        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": ""},
         stdout=subprocess.DEVNULL,
         cwd=ROOT,
     )

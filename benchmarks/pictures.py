@@ -35,6 +35,9 @@ SIDE, CORNER = 256, 100
 # 5 JND.
 NOISE, WAVE, GRAIN, RESIDUE, PATCH, BANDS, CAST = 0.02, 0.02, 0.15, 0.015, 8, 40.0, 0.03
 
+# How many photographs are judged. Status: choice.
+PHOTOGRAPHS = 5
+
 # Beside what the others are held; the pixels per degree of all pictures.
 JUDGE, PPD = "reference", 60.0
 
@@ -115,12 +118,18 @@ def _coded(path: Path) -> Tensor:
     return encode_srgb(read_image(path)[None].clamp(0.0, 1.0))
 
 
+def of_photographs(count: int) -> Iterator[list[Pair]]:
+    """Yield all distortions of a photograph, photograph by photograph."""
+    generator = torch.Generator().manual_seed(1)
+    for photo in photographs(count).values():
+        tests = distorted(photo, generator)
+        yield [Pair(kind, test, photo) for kind, test in tests.items()]
+
+
 def pairs(quick: bool) -> Iterator[Pair]:
     """Yield everything that is judged."""
-    generator = torch.Generator().manual_seed(1)
-    for photo in photographs(1 if quick else 5).values():
-        for kind, test in distorted(photo, generator).items():
-            yield Pair(kind, test, photo)
+    for some in of_photographs(1 if quick else PHOTOGRAPHS):
+        yield from some
     if not quick:
         yield from renders()
 

@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -51,12 +52,6 @@ def ssim() -> Contender:
     return lambda test, reference: ssim(test, reference, 11)
 
 
-def ssim_kept() -> Contender:
-    """Kornia's SSIM where freed memory is kept."""
-    keep_freed_memory()
-    return ssim()
-
-
 def eager() -> Contender:
     """The default metric."""
     return VDM()
@@ -78,12 +73,6 @@ def ssim_loss() -> Contender:
 
     loss = SSIMLoss(11)
     return lambda test, reference: loss(test, reference)
-
-
-def ssim_loss_kept() -> Contender:
-    """Kornia's SSIM loss where freed memory is kept."""
-    keep_freed_memory()
-    return ssim_loss()
 
 
 def eager_loss() -> Contender:
@@ -128,16 +117,22 @@ def pytorch_msssim() -> Contender:
     return lambda test, reference: 1.0 - ssim(test, reference, data_range=1.0)
 
 
-FORWARD = {
+def kept(maker: Callable[[], Contender]) -> Contender:
+    """Return a contender in a process that keeps freed memory, as ours does."""
+    keep_freed_memory()
+    return maker()
+
+
+FORWARD: dict[str, Callable[[], Contender]] = {
     "kornia SSIM": ssim,
-    "kornia SSIM, memory kept": ssim_kept,
+    "kornia SSIM, memory kept": partial(kept, ssim),
     "VDM": eager,
     "VDM compiled": compiled,
     "VDM paper": paper,
 }
-BACKWARD = {
+BACKWARD: dict[str, Callable[[], Contender]] = {
     "kornia SSIM loss": ssim_loss,
-    "kornia SSIM loss, memory kept": ssim_loss_kept,
+    "kornia SSIM loss, memory kept": partial(kept, ssim_loss),
     "VDMLoss": eager_loss,
     "VDMLoss checkpoint": checkpointed_loss,
     "VDMLoss compiled": compiled_loss,

@@ -26,16 +26,16 @@ function layPanes() {
   });
   for (const picked of document.querySelectorAll(".pick")) picked.hidden = !sliding();
   resize();
+  view.size = paneSize();
 }
 
-// As high as the picture asks for; the page's style holds it to the screen.
+// As high as the picture asks for; the page's style holds it to the screen, which may have changed.
 function resize() {
   for (const pane of panes()) {
     pane.style.aspectRatio = `${view.row.width}/${view.row.height}`;
     const sides = [pane.clientWidth, pane.clientHeight].map((side) => Math.max(1, Math.round(side * devicePixelRatio)));
     if (pane.width !== sides[0] || pane.height !== sides[1]) [pane.width, pane.height] = sides;
   }
-  view.size = paneSize();
 }
 
 // The panes may have another size: what was fitted is fitted, and what lay in the middle stays there.
@@ -43,6 +43,7 @@ function resized() {
   if (!view.row || $("frame").hidden) return;
   const before = view.size, { k } = view.transform;
   resize();
+  view.size = paneSize();
   if (Math.min(...before) > 0 && Math.abs(k / fittingScale(before) - 1) > 0.01) {
     centre(k, ...view.transform.invert(before.map((side) => side / 2)));
   } else fit();
@@ -191,8 +192,7 @@ function showScale() {
 
 let asked = 0;
 async function draw() {
-  if (String(paneSize()) !== String(view.size)) resized();
-  else resize(); // the screen may have other pixels
+  resize();
   const number = ++asked;
   $("panes").dataset.asked = number;
   const names = layerNames();

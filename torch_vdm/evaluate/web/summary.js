@@ -103,12 +103,11 @@ function arrange() {
   const wanted = $("filter").value.toLowerCase();
   const found = rows.filter((row) => `${row.frame} ${testName(row)}`.toLowerCase().includes(wanted));
   const compare = order.descending ? d3.descending : d3.ascending; // what has no value comes last
-  order.rows = d3.sort(found, (a, b) => compare(sortValue(a) ?? NaN, sortValue(b) ?? NaN) || missing(a) - missing(b)
-    || a.number - b.number);
+  order.rows = d3.sort(found, (a, b) => compare(sortValue(a), sortValue(b)) || missing(a) - missing(b) || a.number - b.number);
   fillTable();
 }
 
-const missing = (row) => Number((sortValue(row) ?? null) === null);
+const missing = (row) => Number(sortValue(row) === null);
 
 function fillTable() {
   d3.select($("frames").tBodies[0]).selectAll("tr").data(order.rows.slice(0, order.shown), (row) => row.number)
