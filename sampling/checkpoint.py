@@ -75,9 +75,8 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         "arrays": sorted(arrays),
         "values": {name: v for name, v in checkpoint.state.items() if name not in arrays},
     }
-    # Always the same name: a process killed while writing leaves one file, not many. An existing
-    # file there is never written to: it may be a link to something else.
-    temporary = path.with_name(f".{path.name}.partial")
+    # An existing file there is never written to: it may be a link to something else.
+    temporary = partial_of(path)
     try:
         temporary.unlink(missing_ok=True)
         with temporary.open("xb") as file:
@@ -91,6 +90,14 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise CheckpointError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def partial_of(path: Path) -> Path:
+    """Return the file that a checkpoint is while it is written.
+
+    Always the same name: a process killed while writing leaves one file, not many.
+    """
+    return path.with_name(f".{path.name}.partial")
 
 
 def load(path: Path, identity: Mapping[str, Any]) -> dict[str, Any]:

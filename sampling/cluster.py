@@ -20,11 +20,11 @@ from itertools import count, takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sampling.checkpoint import CheckpointError
+from sampling.checkpoint import CheckpointError, partial_of
 from sampling.renderers.mitsuba import MitsubaRenderer, SceneError, preserved
 from torch_vdm import __version__
 from torch_vdm.cluster import LOCAL, ClusterError, answers, check, work
-from torch_vdm.io import ImageError, atomic_path, check_target
+from torch_vdm.io import ImageError, atomic_path, check_target, remove_abandoned
 from torch_vdm.io.refusal import printable
 from torch_vdm.report import progress
 
@@ -147,6 +147,7 @@ def render_all(options: argparse.Namespace, views: Views) -> tuple[str, bool]:
     told = partial(_told, options, folder)
     total = _Sum()
     failed: dict[Picture, str] = {}
+    images = {folder / picture.name for picture in pictures}
     with (
         contextlib.closing(answers(sent, pictures, told, scheduler, workers)) as coming,
         progress("rendering", len(pictures)) as advance,
@@ -167,6 +168,7 @@ def render_all(options: argparse.Namespace, views: Views) -> tuple[str, bool]:
                         number = "" if picture.frame is None else f"frame {picture.frame}: "
                         print(f"vdm-render: {number}{done.failed}", file=said)
                 total.add(picture, done)
+                images |= {folder / Path(view["written"][0]).name for view in done.views}
                 advance()
         except KeyboardInterrupt:
             print(
@@ -174,6 +176,7 @@ def render_all(options: argparse.Namespace, views: Views) -> tuple[str, bool]:
                 file=said,
             )
             raise
+    _clear(images)
     text = total.text(options.output)
     if options.json == "-":
         text = _all(folder, pictures, failed)
@@ -181,6 +184,13 @@ def render_all(options: argparse.Namespace, views: Views) -> tuple[str, bool]:
         with atomic_path(Path(options.json)) as temporary:
             temporary.write_text(_all(folder, pictures, failed))
     return text, bool(failed)
+
+
+def _clear(images: set[Path]) -> None:
+    """Remove what workers that were killed left half-written of pictures."""
+    remove_abandoned([*images, *(image.with_suffix(".json") for image in images)])
+    for image in images:
+        partial_of(image.with_suffix(".checkpoint")).unlink(missing_ok=True)
 
 
 class _Sum:

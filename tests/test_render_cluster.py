@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 import re
+import shutil
 import signal
 import threading
 import time
@@ -18,6 +19,7 @@ from sampling.cli import main
 from sampling.renderers.mitsuba import MitsubaRenderer
 from tests.conftest import one_line_error
 from tests.test_render_cli import same_image
+from torch_vdm.io import atomic_path
 
 distributed = pytest.importorskip("distributed")
 
@@ -112,11 +114,19 @@ def test_what_is_done_stands_and_what_changed_is_done_again(
     moved = out.rename(tmp_path / "moved")
     words[words.index(str(out))] = str(moved)
     out = moved
-    # A worker that dies after its record leaves the checkpoint.
-    left = out / "lamp.checkpoint"
-    left.write_bytes(b"")
+    # A worker that dies after its record leaves the checkpoint; one that dies while it writes, what
+    # it wrote. Another's files stay.
+    left = [out / "lamp.checkpoint", out / ".lamp.checkpoint.partial"]
+    for name in ("lamp.exr", "lamp.json"):
+        with atomic_path(out / name) as temporary:
+            shutil.copy2(out / name, temporary)
+            left.append(temporary)
+    others = [out / ".0123456789abcdef.exr", out / ".note"]
+    for path in (*left, *others):
+        path.write_bytes(b"")
     assert main([*words, "--resume", "--json", "-"]) == 0
-    assert not left.exists()
+    assert not any(path.exists() for path in left)
+    assert all(path.exists() for path in others)
     told = json.loads(capsys.readouterr().out)
     assert [[Path(view["scene"]).name for view in views] for views in told] == [
         ["lamp.xml"],

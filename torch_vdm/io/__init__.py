@@ -7,6 +7,7 @@ from torch_vdm.io.files import (
     check_target,
     load,
     read_image,
+    remove_abandoned,
     write_channels,
     write_image,
 )
@@ -20,6 +21,7 @@ __all__ = [
     "check_target",
     "load",
     "read_image",
+    "remove_abandoned",
     "write_channels",
     "write_image",
 ]

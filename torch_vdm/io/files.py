@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import hashlib
 import os
 import re
 import secrets
@@ -9,7 +10,7 @@ import stat
 import sys
 import threading
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, TypeAlias
@@ -357,7 +358,7 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
     """
     target = Path(os.path.realpath(path))
     # Not tempfile.mkstemp: only their owner could read its files, and so the result.
-    temporary = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
+    temporary = target.with_name(f".{_mark(target)}{secrets.token_hex(4)}{target.suffix}")
     ours = {str(name) for name in (None, temporary, target, target.parent)}
     try:
         check_target(target)
@@ -371,6 +372,31 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_abandoned(paths: Iterable[Path]) -> None:
+    """Remove the temporary files of `atomic_path` that killed processes left next to some files.
+
+    Nobody may be writing these files.
+    """
+    marks: dict[Path, set[tuple[str, str]]] = {}
+    for path in paths:
+        target = Path(os.path.realpath(path))
+        marks.setdefault(target.parent, set()).add((_mark(target), target.suffix))
+    for folder, ours in marks.items():
+        for path in folder.glob(".*"):
+            found = _TEMPORARY.fullmatch(path.name)
+            if found and found.groups() in ours:
+                path.unlink(missing_ok=True)
+
+
+# What `_mark` gives, what is drawn, and the suffix.
+_TEMPORARY = re.compile(r"\.([0-9a-f]{8})[0-9a-f]{8}(\.[^.]*)?")
+
+
+def _mark(target: Path) -> str:
+    """Return what the temporary files of a target begin with; its name may be too long for that."""
+    return hashlib.sha256(os.fsencode(target.name)).hexdigest()[:8]
 
 
 def check_target(target: Path) -> None:
