@@ -25,7 +25,7 @@ from sampling.renderers.filter import SCENE
 from sampling.renderers.mitsuba import MitsubaRenderer, preserved
 from sampling.sampler import Report, Sampler, Settings, StrategyName, rounds, under
 from torch_vdm import VDM, Display, Observer, __version__
-from torch_vdm.io import atomic_path, write_channels
+from torch_vdm.io import write_channels
 from torch_vdm.model.distance import VISIBLE
 
 Plane = NDArray[np.float64]
@@ -109,8 +109,6 @@ class Result:
         ImageError
             If the name does not end in ``.exr``, or the file cannot be written.
         """
-        import OpenEXR
-
         planes: dict[str, NDArray[Any]] = dict(
             zip("RGB", np.moveaxis(self.image, -1, 0), strict=True)
         )
@@ -119,13 +117,7 @@ class Result:
             planes[f"variance.{name}"] = plane
         planes |= self.aovs
         tensors = {name: torch.tensor(p, dtype=torch.float32) for name, p in planes.items()}
-        if Path(path).suffix.lower() != ".exr":
-            write_channels(path, tensors)  # refuses it in words
-        with atomic_path(path) as temporary:
-            write_channels(temporary, tensors)
-            with OpenEXR.File(str(temporary), separate_channels=True) as file:
-                file.header().update(self.header)
-                file.write(str(temporary))
+        write_channels(path, tensors, self.header)
 
     def save_checkpoint(self, path: str | os.PathLike[str]) -> None:
         """Write a checkpoint from which a later run continues with ``resume``.

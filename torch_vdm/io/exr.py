@@ -200,11 +200,12 @@ def _decoded(data: bytes) -> dict[str, Floats]:
     return {name: channel.pixels for name, channel in parts[0].channels.items()}
 
 
-def encode_exr(channels: Mapping[str, Floats]) -> bytes:
-    """Return planes (H, W) as a file of float channels of these names."""
+def encode_exr(channels: Mapping[str, Floats], entries: Mapping[str, str] | None = None) -> bytes:
+    """Return planes (H, W) as a file of float channels of these names, with header entries."""
     import OpenEXR
 
     header = {
+        **(entries or {}),
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "chromaticities": BT709,

@@ -305,7 +305,9 @@ def write_image(path: PathLike, image: Tensor) -> None:
         temporary.write_bytes(encoded)
 
 
-def write_channels(path: PathLike, channels: Mapping[str, Tensor]) -> None:
+def write_channels(
+    path: PathLike, channels: Mapping[str, Tensor], header: Mapping[str, str] | None = None
+) -> None:
     """Write an OpenEXR file of 32-bit float channels of any names, whole or not at all.
 
     Parameters
@@ -316,6 +318,8 @@ def write_channels(path: PathLike, channels: Mapping[str, Tensor]) -> None:
     channels
         Planes (H, W) of one size by channel name. R, G, B are linear BT.709; others are what their
         names say.
+    header
+        Further entries of the file's header.
 
     Raises
     ------
@@ -330,9 +334,8 @@ def write_channels(path: PathLike, channels: Mapping[str, Tensor]) -> None:
             f"{os.fspath(path)}: expected channels of one shape (H, W) with at least one pixel, "
             f"got {sorted(shapes)}"
         )
-    encoded = encode_exr(
-        {name: plane.detach().to("cpu", torch.float32).numpy() for name, plane in channels.items()}
-    )
+    planes = {n: plane.detach().to("cpu", torch.float32).numpy() for n, plane in channels.items()}
+    encoded = encode_exr(planes, header)
     with atomic_path(path) as temporary:
         temporary.write_bytes(encoded)
 
