@@ -46,8 +46,8 @@ from torch_vdm import VDM, Display, Effects, Observer
 from torch_vdm.model.cortex import Cortex, Transform, bands
 from torch_vdm.model.filtering import band_contrast, band_sensitivity
 from torch_vdm.model.masking import unmasked
-from torch_vdm.model.pooling import covering, phase_energy, pool_halves, surround_halves
-from torch_vdm.model.quadtree import push
+from torch_vdm.model.pooling import covering, phase_energy, pool_halves
+from torch_vdm.model.quadtree import push, surround
 
 MECHANISMS = ("achromatic", "red-green", "yellow-violet", "mixed")
 
@@ -215,7 +215,7 @@ class _Coefficients:
         energy = phase_energy(weighted, self.transform.phases)
         planes = torch.cat((energy, (weighted * weighted).sum(2, keepdim=True)), 2)
         if self.transform.shifts > 1:
-            around = surround_halves(planes, 3)
+            around = surround(planes, 3, 2)
             pooled = pool_halves(pool_halves(around, 3, -1), 3, -2) / covering(3)
         else:
             around = functional.pad(planes, (*self.sides, 0, 0), mode="replicate")

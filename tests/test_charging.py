@@ -18,7 +18,6 @@ from tests.reference import calibrated
 from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, VDMLoss
 from torch_vdm.model.charging import charge
 from torch_vdm.model.cortex import Transform, bands
-from torch_vdm.model.quadtree import apart, stacked
 from torch_vdm.run import schedule
 
 PPD = 60.0
@@ -320,17 +319,6 @@ def test_what_is_charged_is_the_references(
         assert charged.own is not None
         expected = np.vectorize(calibrated.own_share, [float])(ratios)
         np.testing.assert_allclose(charged.own[0, 0].numpy(), expected, rtol=within)
-
-
-@pytest.mark.parametrize("filtered", [False, True])
-def test_planes_below_one_another_are_charged_each_by_itself(filtered: bool) -> None:
-    planes = torch.stack([torch.from_numpy(of_differences((6, 5), s)) for s in (0.1, 0.3, 1.0)])
-    below = charge(stacked(planes.unsqueeze(1)), 1, filtered, 3)
-    by_themselves = charge(planes.unsqueeze(1), 1, filtered)
-    for ours, expected in zip(below, by_themselves, strict=True):
-        assert (ours is None) == (expected is None)
-        if ours is not None and expected is not None:
-            assert torch.equal(apart(ours[0, 0], 3).unsqueeze(1), expected)
 
 
 @settings(max_examples=12)

@@ -165,3 +165,52 @@ def test_what_is_asked_for_is_done() -> None:
     assert VDM.paper().plan(local, grey).differing == (None,)
     with pytest.raises(ValueError, match='expected effects "auto" or "full", got'):
         VDM(effects="some")  # type: ignore[arg-type]  # wrong on purpose
+
+
+@each
+@pytest.mark.parametrize("way", ["eager", "compiled", "mask"])
+def test_a_plan_of_grey_pairs_that_is_passed_in(transform: Transform, way: str) -> None:
+    if way == "compiled" and transform != Haar():
+        pytest.skip("one transform is enough of the compiler's time")
+    test, reference = (picture(2, 1, 45, 70, seed=seed) for seed in (1, 2))
+    pair = [image.expand(-1, 3, -1, -1).contiguous() for image in (test, reference)]
+    auto = VDM(30.0, transform=transform)
+    plan = auto.plan(*pair)
+    assert plan.grey
+    full, given = (
+        VDM(
+            30.0,
+            transform=transform,
+            effects=effects,
+            nonfinite="mask" if way == "mask" else "raise",
+        )
+        for effects in ("full", plan)
+    )
+    assert "grey" in repr(given)
+    if way == "compiled":
+        given.compile()
+    assert given.plan(*pair).grey
+    torch.testing.assert_close(given(*pair), full(*pair), rtol=0.0, atol=MOST)
+    # Of the one plane that all three channels come from, the gradient is that of everything.
+    gradients = []
+    for metric in (given, full):
+        plane = test.clone().requires_grad_()
+        metric.power(plane.expand(-1, 3, -1, -1), pair[1]).sum().backward()
+        gradients.append(plane.grad)
+    largest = float(gradients[1].abs().max())  # type: ignore[union-attr]  # it is there
+    torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-4 * largest)
+
+
+def test_a_plan_of_grey_pairs_is_for_grey_pairs() -> None:
+    grey = picture(1, 1, 20, 30).expand(-1, 3, -1, -1)
+    metric = VDM(effects=VDM(effects=Effects(pooling=False)).plan(grey, 0.5 * grey))
+    # An `Effects` leaves nothing out, and so does its plan; a grey one keeps its effects.
+    assert not metric.plan(grey, 0.5 * grey).grey
+    assert not metric.effects.pooling
+    metric = VDM(effects=VDM().plan(grey, 0.5 * grey))
+    coloured = grey.clone()
+    coloured[:, 2, 7, 9] += 0.01
+    with pytest.raises(
+        ValueError, match=r'expected grey images, .* got colours; take effects="auto"'
+    ):
+        metric(coloured, grey)

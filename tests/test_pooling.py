@@ -6,8 +6,8 @@ import torch
 from torch.nn import functional
 
 from tests.reference import paper
-from torch_vdm.model.pooling import pool, surround, within
-from torch_vdm.model.quadtree import stacked
+from torch_vdm.model.pooling import pool
+from torch_vdm.model.quadtree import surround
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 4), (2, 2), (5, 7)])
@@ -16,15 +16,6 @@ def test_is_the_reference(size: tuple[int, int]) -> None:
     expected = paper.spatial_pooling(responses, paper.ALL_ON)
     actual = pool(surround(torch.from_numpy(responses)[None]))[0].numpy()
     np.testing.assert_allclose(actual, expected, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 4), (2, 2), (5, 7)])
-def test_planes_below_one_another_are_pooled_each_by_itself(size: tuple[int, int]) -> None:
-    responses = torch.rand(3, 2, *size)
-    below = stacked(responses).unsqueeze(2)
-    pooled = within(pool(surround(below, 3)), 3 * size[0], 3)
-    expected = stacked(pool(surround(responses.unsqueeze(2)))[:, :, 0])
-    torch.testing.assert_close(pooled[:, :, 0], expected)
 
 
 def test_is_the_mean_of_nine_inside() -> None:

@@ -6,7 +6,7 @@ import torch
 from tests.reference import calibrated, paper
 from torch_vdm.model import quadtree
 from torch_vdm.model.grid import UNSHIFTED, Before, Grid, thirds
-from torch_vdm.model.quadtree import apart, pad_even, push, stacked
+from torch_vdm.model.quadtree import pad_even, push
 
 SIZES = [(1, 1), (1, 2), (2, 1), (2, 2), (3, 5), (8, 8), (7, 12)]
 
@@ -39,18 +39,6 @@ def test_push_gives_children_their_parent(height: int, width: int, before: Befor
         for x in range(width):
             parent = parents[..., (y + before[0]) // 2, (x + before[1]) // 2]
             assert torch.equal(children[..., y, x], parent)
-
-
-@each_before
-@pytest.mark.parametrize(("height", "width"), SIZES)
-def test_trees_below_one_another_are_pushed_each_by_itself(
-    height: int, width: int, before: Before
-) -> None:
-    parents = parents_of(3, height, width, before)
-    children = push(stacked(parents), (3 * height, width), 3, before)
-    expected = push(parents, (height, width), before=before)
-    assert torch.equal(children, stacked(expected))
-    assert torch.equal(apart(children[0], 3).transpose(0, 1), expected)
 
 
 @pytest.mark.parametrize("side", [*range(1, 70), 255, 256, 257, 1000, 1080, 1920, 4096, 2**24])

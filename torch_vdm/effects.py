@@ -1,6 +1,8 @@
 """Which effects are simulated."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, fields
+from typing import Self
 
 from torch_vdm.options import switch
 
@@ -30,6 +32,11 @@ class Effects:
         """Refuse anything but True or False."""
         for field in fields(self):
             switch(field.name, getattr(self, field.name))
+
+    @classmethod
+    def named(cls, names: Collection[str]) -> Self:
+        """Return the switches of which those of these names are on."""
+        return cls(**{field.name: field.name in names for field in fields(cls)})
 
     def names(self) -> list[str]:
         """Return the names of the effects that are on."""

@@ -110,26 +110,25 @@ def finite_in_both(test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Ten
     with a finite pixel, of 2, 4 ... `SQUARE` pixels a side from the image's corner, so that it
     masks nothing around it.
     """
-    images = test.detach(), reference.detach()
-    finite = [torch.isfinite(image).all(1, keepdim=True) for image in images]
-    known = [torch.where(there, image, 0.0) for image, there in zip(images, finite, strict=True)]
-    value = torch.where(finite[0], known[0], known[1])
-    total = 0.5 * known[0] + 0.5 * known[1]
-    count = 0.5 * finite[0].to(total) + 0.5 * finite[1].to(total)
-    either, seen = finite[0] | finite[1], finite[0] & finite[1]
-    filled = torch.where(either, value, _around(total, count, SQUARE))
+    images = torch.stack((test.detach(), reference.detach()))
+    finite = torch.isfinite(images).all(2, keepdim=True)
+    known = torch.where(finite, images, 0.0)
+    # Sums over both images, and how many are finite: of squares both become means, by one ratio.
+    sums = torch.cat((known, finite.to(known)), 2).mean(0)
+    value, either, seen = torch.where(finite[0], known[0], known[1]), finite.any(0), finite.all(0)
+    filled = torch.where(either, value, _around(sums, SQUARE))
     return torch.where(seen, test, filled), torch.where(seen, reference, filled), seen
 
 
-def _around(total: Tensor, count: Tensor, side: int) -> Tensor:
+def _around(sums: Tensor, side: int) -> Tensor:
     """Return at every pixel the mean of the smallest square with a finite pixel; 0 if none has one.
 
-    ``total`` (B, C, h, w) over ``count`` (B, 1, h, w) is the mean; the largest square has ``side``
-    pixels a side.
+    ``sums`` (B, C + 1, h, w): the sum of the finite pixels of each square, and their number, the
+    last channel, both divided by the same. The largest square has ``side`` pixels a side.
     """
-    mean = torch.where(count > 0.0, total / count, 0.0)
+    total, count = sums[:, :-1], sums[:, -1:]
     if side == 1:
-        return mean
-    coarse = [functional.avg_pool2d(plane, 2, ceil_mode=True) for plane in (total, count)]
-    wider = _around(coarse[0], coarse[1], side // 2)
-    return torch.where(count > 0.0, mean, push(wider, (total.shape[-2], total.shape[-1])))
+        return torch.where(count > 0.0, total / count, 0.0)
+    wider = _around(functional.avg_pool2d(sums, 2, ceil_mode=True), side // 2)
+    wider = push(wider, (sums.shape[-2], sums.shape[-1]))
+    return torch.where(count > 0.0, total / count, wider)

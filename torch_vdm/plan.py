@@ -118,7 +118,7 @@ def plan_of(test: Tensor, reference: Tensor, effects: tuple[str, ...], regions: 
         equal.append(squares is not None and not bool(squares.any()))
         few = regions and squares is not None and not equal[-1] and _few(squares, one)
         differing.append(squares if few else None)
-    grey = not all(equal) and _grey(test) and _grey(reference)
+    grey = not all(equal) and is_grey(test) and is_grey(reference)
     return Plan(effects, tuple(equal), tuple(differing), SQUARE, grey)
 
 
@@ -141,7 +141,7 @@ def _differing(test: Tensor, reference: Tensor) -> Tensor | None:
     return (whole.view(torch.int64) != 0).view(down, SQUARE, across).any(1)
 
 
-def _grey(image: Tensor) -> bool:
+def is_grey(image: Tensor) -> bool:
     """Return whether the three channels (B, 3, H, W) are equal, and nothing is below 0."""
     red, green, blue = image.unbind(1)
     for rows in (slice(None, None, ROWS), slice(None)):

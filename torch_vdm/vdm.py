@@ -1,6 +1,7 @@
 """The visual difference metric as a module: its options and its methods."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -22,7 +23,7 @@ from torch_vdm.model.steps import Steps
 from torch_vdm.observer import Observer
 from torch_vdm.options import choice
 from torch_vdm.pair import Nonfinite, Numbers, PairMetric
-from torch_vdm.plan import Plan, everything, plan_of
+from torch_vdm.plan import Plan, everything, is_grey, plan_of
 from torch_vdm.precision import computed_in
 from torch_vdm.run import regions, strips, whole
 from torch_vdm.run.schedule import Schedule, chosen
@@ -58,7 +59,10 @@ class VDM(PairMetric):
         How the image is decomposed: `Haar()`, the default, `StationaryHaar()` or `Steerable()`.
     effects
         What is simulated. "auto", the default: everything, except that what a pair does not need is
-        not computed, see `plan`. "full": all of it is computed. Or an `Effects`.
+        not computed, see `plan`. "full": all of it is computed. Or an `Effects`. Or a `Plan`, as
+        `plan` gives it for some pairs of a data set: of all pairs is left out what it leaves out of
+        grey ones, on every device, with gradients and in compiled code. An image that is not grey
+        is then a ValueError, where values may be read.
     nonfinite
         "raise": NaN or infinity in an image is a ValueError that names the batch item (a graph
         of torch.export cannot raise: there it gives NaN). For this, one number per image is read
@@ -82,7 +86,7 @@ class VDM(PairMetric):
         display: Display | None = None,
         observer: Observer | None = None,
         transform: Transform | None = None,
-        effects: Effects | Literal["auto", "full"] | None = None,
+        effects: Effects | Plan | Literal["auto", "full"] | None = None,
         nonfinite: Nonfinite = "raise",
         schedule: Schedule | None = None,
     ) -> None:
@@ -99,12 +103,15 @@ class VDM(PairMetric):
             )
         self.transform = transform or Haar()
         self.observer = (observer or Observer.calibrated()).fitted_to(self.transform)
-        if not isinstance(effects, Effects | str | None):
-            raise ValueError(f'expected effects: "auto", "full" or Effects, got {effects!r}')
+        if not isinstance(effects, Effects | Plan | str | None):
+            raise ValueError(f'expected effects: "auto", "full", Effects or Plan, got {effects!r}')
         if isinstance(effects, str):
             choice("effects", effects, ("auto", "full"))
+        self._planned = effects is None or effects == "auto"
+        self._grey = isinstance(effects, Plan) and effects.grey
+        if isinstance(effects, Plan):
+            effects = Effects.named(effects.effects)
         self.effects = effects if isinstance(effects, Effects) else Effects()
-        self._planned = effects in ("auto", None)
         if schedule is not None and schedule.stacked and not self._stackable:
             raise ValueError(
                 f"expected a schedule that is not stacked with {self.transform}, got one that is; "
@@ -150,34 +157,56 @@ class VDM(PairMetric):
         return (
             f"ppd={self.ppd}, display={self.display}, observer={self.observer.name}, "
             f"transform={self.transform}, "
-            f"effects={'auto' if self._planned else self.effects.names()}, "
+            f"effects={'auto' if self._planned else self.effects.names()}"
+            f"{' of grey images' if self._grey else ''}, "
             f"schedule={self.schedule or 'chosen for each pair'}"
         )
 
     def model(self, dtype: torch.dtype, steps: Steps | None = None, grey: bool = False) -> Model:
         """Return the model with constants of a precision; see `torch_vdm.model.model`."""
+        constants = self._constants(dtype)
+        known = self._levels[dtype] if self._has_own_constants() else None
         return Model(
             self.display,
             self.observer,
             self.transform,
             self.effects,
-            self._constants(dtype),
+            constants,
             self._schedule if steps is None else steps,
             grey,
             self.observer.summation_exponent == CUBES and self._is_own("summation_exponent"),
+            known,
         )
+
+    def _place(self, device: torch.device) -> None:
+        """Make the constants on a device, and what all levels respond to."""
+        super()._place(device)
+        options = self.display, self.observer, self.transform, self.effects
+        with torch.no_grad(), torch.inference_mode(False):
+            self._levels = {
+                dtype: Model(*options, constants).all_levels()
+                for dtype, constants in self._cast.items()
+            }
 
     def plan(self, test: Tensor, reference: Tensor) -> Plan:
         """Return what is computed for a pair, (B, 3, H, W) twice, and what is left out, and why.
 
         What is left out changes the map by rounding only. Something is left out only on the CPU,
-        without gradients or compiled code, and where values may be read.
+        without gradients or compiled code, and where values may be read; for other cases see the
+        parameter ``effects``.
         """
         test, reference, _ = self._checked(test, reference)
         return self._plan(test, reference)
 
     def _plan(self, test: Tensor, reference: Tensor) -> Plan:
         names = tuple(self.effects.names())
+        if self._grey:
+            if self._reads(test) and not (is_grey(test) and is_grey(reference)):
+                raise ValueError(
+                    "expected grey images, as those of the plan that was given, got colours; "
+                    'take effects="auto"'
+                )
+            return replace(everything(names, len(test)), grey=True)
         job = self._job(test, reference)
         reads = self.nonfinite == "raise" and test.device.type == "cpu" and can_be_read(test)
         if not self._planned or job.gradients or job.compiles or job.traced or not reads:
@@ -286,10 +315,10 @@ class VDM(PairMetric):
         """Return `compare` with a fixed first representation, whose responses are computed once.
 
         The eye's adaptation is not computed again for a second one with the windows of the first.
-        The first may serve a batch of others, (1, ...) against (B, ...), but not images stacked
-        vertically. It nearly halves the time when many are compared with one; the last bits differ
-        from `compare`. Coarse differences are charged to all pixels below them, which makes no
-        difference to the largest value of the map for noise that is everywhere.
+        The first may serve a batch of others, (1, ...) against (B, ...). It nearly halves the time
+        when many are compared with one; the last bits differ from `compare`. Coarse differences are
+        charged to all pixels below them, which makes no difference to the largest value of the map
+        for noise that is everywhere.
         """
         model = self.model(first.mean.dtype)
         sights = model.adaptation(first)

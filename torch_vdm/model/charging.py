@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_vdm.model.quadtree import apart, together
+from torch_vdm.model.quadtree import surround
+from torch_vdm.model.steps import PLAIN, Steps
 
 # Radii of a node's neighbourhood and of its surroundings, in node widths. The second is as far as
 # pooling and the lowpass of a parent spread the difference of a parent's neighbour: two nodes of
@@ -60,9 +61,7 @@ def changes(first: Tensor, second: Tensor) -> Tensor:
     return (difference * difference).sum(1, keepdim=True)
 
 
-def charge(
-    change: Tensor, shifts: int, filtered: bool, items: int = 1, cached: bool = False
-) -> Charge:
+def charge(change: Tensor, shifts: int, filtered: bool, steps: Steps = PLAIN) -> Charge:
     """Return the shares that every node of a level is charged.
 
     Parameters
@@ -73,29 +72,33 @@ def charge(
         As `Transform.shifts`.
     filtered
         Whether the decomposed planes were filtered.
-    items
-        How many images are stacked vertically.
-    cached
-        As `Steps.cached`.
+    steps
+        How steps are called.
     """
-    # Each image separately.
-    planes = change if items == 1 else apart(change[0, 0], items).unsqueeze(1)
-    near, around = (_mean_around(planes, nodes * shifts, cached) for nodes in (NEAR, AROUND))
-    ratio = near / around.clamp_min(torch.finfo(around.dtype).tiny)
-    if items > 1:
-        ratio = together(ratio.squeeze(1))[None, None]
+    around = surround(change, AROUND * shifts, AROUND * shifts)
+    charged: Charge = steps.valid(charge_within, around, shifts, filtered, steps.cached)
+    return charged
+
+
+def charge_within(around: Tensor, shifts: int, filtered: bool, cached: bool) -> Charge:
+    """Return `charge` for planes with `AROUND` node widths around them, (B, 1, h, w) without.
+
+    ``cached`` is as `Steps.cached`; other arguments are as in `charge`.
+    """
+    inner = (AROUND - NEAR) * shifts
+    near = _mean(around[..., inner:-inner, inner:-inner], NEAR * shifts, cached)
+    ratio = near / _mean(around, AROUND * shifts, cached).clamp_min(torch.finfo(near.dtype).tiny)
     inherited = (ratio * (1.0 + SOFT) / (ratio + SOFT)).clamp_max(1.0)
     own = (ratio / FAINT).clamp_max(1.0) if filtered else None
     return Charge(inherited**POWER, None if own is None else own**POWER)
 
 
-def _mean_around(plane: Tensor, nodes: int, cached: bool) -> Tensor:
-    """Return the mean within a radius of ``nodes``, the border repeated."""
-    padded = functional.pad(plane, (nodes,) * 4, mode="replicate")
+def _mean(around: Tensor, nodes: int, cached: bool) -> Tensor:
+    """Return the mean within a radius of ``nodes``, of all places that have so many around them."""
     side = 2 * nodes + 1
-    if not cached or plane.numel() <= SMALL:
-        return functional.avg_pool2d(padded, side, 1)
-    return _sums(_sums(padded, side, -1), side, -2) / float(side * side)
+    if not cached or around.numel() <= SMALL:
+        return functional.avg_pool2d(around, side, 1)
+    return _sums(_sums(around, side, -1), side, -2) / float(side * side)
 
 
 def _sums(plane: Tensor, side: int, dim: int) -> Tensor:

@@ -85,7 +85,6 @@ class Paths(NamedTuple):
 def accumulate(
     local: Sequence[Tensor],
     root: Tensor,
-    items: int = 1,
     before: Sequence[Before] = (),
     charges: Sequence[Charge] | None = None,
 ) -> Tensor:
@@ -97,8 +96,6 @@ def accumulate(
         One (B, 1, h, w) per level, level 0 (the root) first; none for an image of one pixel.
     root
         (B, 1, 1, 1), the value that every path starts from: the lowpass term, or 0.
-    items
-        How many trees are stacked vertically; the root is then (1, 1, items, 1).
     before
         For each level, how many nodes are put before its first; none by default.
     charges
@@ -111,7 +108,7 @@ def accumulate(
     """
     total = root
     for level, (nodes, first) in enumerate(zip(local, before or [NONE] * len(local), strict=True)):
-        total = push(total, (nodes.shape[-2], nodes.shape[-1]), items, first)
+        total = push(total, (nodes.shape[-2], nodes.shape[-1]), first)
         if charges is None:
             total = nodes + total
             continue

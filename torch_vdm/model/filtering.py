@@ -66,7 +66,9 @@ def weights(
     grey = luminances * constants["cones"].sum(1, keepdim=True)
     at_bands = (part[..., None, None] for part in (ones, frequency, ones, bright))
     level = Level(*at_bands)
-    sensitivity = sensitivity_at(grey[None, :, None], level, constants, chromatic)[0, :, :, 0]
+    relative = torch.log2(level.frequency / constants["peak_frequency"])
+    found = sensitivity_at(grey[None, :, None], level, relative, constants, chromatic)
+    sensitivity = found[0, :, :, 0]
     achromatic = (constants["band_weights"][..., None] * sensitivity[0]).sum(1)
     dim = sensitivity[-1, 0] / bright[-1, 0]
     if not chromatic:

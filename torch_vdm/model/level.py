@@ -33,11 +33,8 @@ from torch_vdm.model.pooling import (
     pool,
     pool_halves,
     pool_sums,
-    surround,
-    surround_halves,
-    within,
 )
-from torch_vdm.model.quadtree import push
+from torch_vdm.model.quadtree import push, surround
 from torch_vdm.model.steps import PLAIN, Steps
 
 # The constants that the sensitivity at the local luminance depends on.
@@ -62,18 +59,18 @@ class Level(NamedTuple):
     """What a level of the transform responds to, as far as it does not depend on the image.
 
     For planes (h, w) of one level the last two dimensions are 1 and 1; for the nodes of several
-    levels in a row they are 1 and the number of nodes. The dimension of the orientations is 1
+    levels in a column they are the number of nodes and 1. The dimension of the orientations is 1
     where all of them have the same value.
     """
 
     passed: Tensor
-    """(3, 1, 1): the fraction of each cone's details that chromatic aberration passes."""
+    """(1, 3, 1, 1): the fraction of each cone's details that chromatic aberration passes."""
     frequency: Tensor
-    """(orientations, 1, 1), in cycles/degree: the frequency of the best response."""
+    """(1, orientations, 1, 1), in cycles/degree: the frequency of the best response."""
     gain: Tensor
-    """(orientations, 1, 1): what contrast is divided by."""
+    """(1, orientations, 1, 1): what contrast is divided by."""
     sensitivity: Tensor
-    """(channels, orientations, 1, 1): the contrast sensitivity, divided by the gain. Where the
+    """(1, channels, orientations, 1, 1): the contrast sensitivity, divided by the gain. Where the
     luminance is local, that of C1 and C2 in bright light."""
 
 
@@ -92,23 +89,22 @@ class Levels(NamedTuple):
     def only(self, number: int) -> Level:
         """Return one level."""
         # Copies: compiled code is specialised on views and their offsets.
-        return Level(*(part[number, ..., None, None].clone() for part in self))
+        return Level(*(part[None, number, ..., None, None].clone() for part in self))
 
-    def in_a_row(self, nodes: Sequence[int]) -> Level:
-        """Return the coarsest levels as one, whose plane is the ``nodes`` of each in a row."""
-        # The level of each node; the size is given so that nothing is read back from the device.
-        counts = torch.tensor(nodes, device=self.passed.device)
-        which = torch.repeat_interleave(counts, output_size=sum(nodes))
-        # Selecting from two dimensions is much faster than from three. Copies, as in `only`.
+    def in_a_column(self, which: Tensor) -> Level:
+        """Return the levels as one, whose plane is a column of nodes.
+
+        ``which``: (N,), the level of each node. Every number is then given for each.
+        """
+        # All at once, and from two dimensions, which is much faster than from three.
+        flat = [part.flatten(1) for part in self]
+        found = torch.cat(flat, 1).mT.contiguous().index_select(1, which)
+        parts = found.split([part.shape[1] for part in flat])
+        # Copies, as in `only`.
         return Level(
             *(
-                part.flatten(1)
-                .mT.contiguous()
-                .index_select(1, which)
-                .unflatten(0, part.shape[1:])
-                .unsqueeze(-2)
-                .clone()
-                for part in self
+                part.unflatten(0, (1, *of.shape[1:])).unsqueeze(-1).clone()
+                for part, of in zip(parts, self, strict=True)
             )
         )
 
@@ -124,12 +120,15 @@ class Sight(NamedTuple):
     """(B, channels, orientations, h, w): the contrast sensitivity of each channel; a single
     orientation or node where all have the same."""
 
-    def pushed(self, size: tuple[int, int], items: int = 1, before: Before = NONE) -> "Sight":
+    def pushed(self, size: tuple[int, int], before: Before = NONE) -> "Sight":
         """Return the weighting given at the parents for their children; arguments as in `push`."""
+
+        def at_children(parents: Tensor) -> Tensor:
+            return push(parents, size, before).contiguous()
+
         shared = self.sensitivity.shape[-2:] == (1, 1)
-        children = size, items, before
-        sensitivity = self.sensitivity if shared else push(self.sensitivity, *children)
-        return Sight(None if self.scale is None else push(self.scale, *children), sensitivity)
+        sensitivity = self.sensitivity if shared else at_children(self.sensitivity)
+        return Sight(None if self.scale is None else at_children(self.scale), sensitivity)
 
     def of(self, orientations: slice) -> "Sight":
         """Return the channel weighting of some orientations."""
@@ -167,6 +166,13 @@ class Options(NamedTuple):
         """
         return self.signed or self.overlapping
 
+    @property
+    def ring(self) -> tuple[int, int]:
+        """How many nodes before and after each, in y and in x, are pooled with it."""
+        if self.overlapping:
+            return self.pooled, self.pooled - 1
+        return self.pooled // 2, self.pooled // 2
+
 
 def local_difference(
     details: Tensor,
@@ -175,7 +181,6 @@ def local_difference(
     other_sight: Sight,
     options: Options,
     steps: Steps = PLAIN,
-    items: int = 1,
 ) -> Tensor:
     """Return the local visual difference (B, 1, h, w) of two images at a level.
 
@@ -183,29 +188,26 @@ def local_difference(
     the nodes themselves.
     """
     difference = steps(response_difference, details, others, sight, other_sight, options)
-    return gathered(difference, options, steps, items)
+    return gathered(difference, options, steps)
 
 
-def gathered(difference: Tensor, options: Options, steps: Steps = PLAIN, items: int = 1) -> Tensor:
+def gathered(difference: Tensor, options: Options, steps: Steps = PLAIN) -> Tensor:
     """Return the local visual difference (B, 1, h, w) from the `difference_of` two images."""
-    around = surrounded(difference, options, steps, items)
-    return within(steps(pooled_difference, around, options), difference.shape[-2], items)
+    around = summed_across(surround(difference, *options.ring), options, steps)
+    local: Tensor = steps.valid(pooled_difference, around, options)
+    return local
 
 
-def surrounded(
-    difference: Tensor, options: Options, steps: Steps = PLAIN, items: int = 1
-) -> Tensor:
-    """Return the `difference_of` two images with the neighbours that `pooled_difference` needs."""
-    if options.overlapping:
-        rows: Tensor = steps(
-            pool_halves, surround_halves(difference, options.pooled), options.pooled, -1
-        )
-        return rows
-    return surround(difference, items) if options.pooled > 1 else difference
+def summed_across(around: Tensor, options: Options, steps: Steps = PLAIN) -> Tensor:
+    """Return what `pooled_difference` takes of the `difference_of` two images with its ring."""
+    if not options.overlapping:
+        return around
+    summed: Tensor = steps(pool_halves, around, options.pooled, -1)
+    return summed
 
 
 def pooled_difference(around: Tensor, options: Options) -> Tensor:
-    """Return the local visual difference from what `surrounded` gives.
+    """Return the local visual difference from what `summed_across` gives.
 
     The paper's responses are pooled as a difference, because pooling is linear; others as squares.
     """
@@ -303,12 +305,14 @@ def sights_of(
     planes are ``grey`` times it.
     """
     sights = []
+    # How far the frequency is from the peak in bright light, in octaves.
+    relative = torch.log2(level.frequency / constants["peak_frequency"]) if local else None
     for plane in parents:
         parent = of_grey(plane, grey)
         scale = level.passed / adapted(parent, constants["dark_cones"])
-        sensitivity = level.sensitivity.unsqueeze(0)
-        if local:
-            sensitivity = sensitivity_at(parent, level, constants, chromatic)
+        sensitivity = level.sensitivity
+        if relative is not None:
+            sensitivity = sensitivity_at(parent, level, relative, constants, chromatic)
         if grey is not None:
             # Per unit of detail: the contrasts of the three cones, mixed, times the sensitivity.
             mixed = mix(constants["opponents"], of_grey(scale, grey)).unsqueeze(2)
@@ -325,14 +329,20 @@ def adapted_luminance(lowpass: Tensor, constants: Mapping[str, Tensor]) -> Tenso
 
 
 def sensitivity_at(
-    parent: Tensor, level: Level, constants: Mapping[str, Tensor], chromatic: bool
+    parent: Tensor,
+    level: Level,
+    relative: Tensor,
+    constants: Mapping[str, Tensor],
+    chromatic: bool,
 ) -> Tensor:
-    """Return the contrast sensitivity at the local luminance of the parents."""
+    """Return the contrast sensitivity at the local luminance of the parents.
+
+    ``relative``: how many octaves the level's frequency is above the peak in bright light.
+    """
     luminance = adapted_luminance(parent, constants).unsqueeze(2)
     dark = torch.log2(1.0 + constants["dim_luminance"] / luminance)
     glare = torch.log2(1.0 + luminance / constants["glare_luminance"])
     faint = torch.log2(1.0 + constants["peak_luminance"] / luminance)
-    relative = torch.log2(level.frequency / constants["peak_frequency"])
     octaves = relative + constants["peak_exponent"] * faint
     dimmed = constants["achromatic_dimming"] * dark + constants["glare_exponent"] * glare
     shape = bandpass(octaves, constants["band_width"], constants["band_floor"])

@@ -22,7 +22,7 @@ from torch_vdm.model.cones import cone_responses, of_grey
 from torch_vdm.model.contrast import opponents, weber_contrast
 from torch_vdm.model.cortex import Cortex, Transform
 from torch_vdm.model.cortex.haar import lowpass_of_light
-from torch_vdm.model.cortex.transform import Base, mean_of
+from torch_vdm.model.cortex.transform import DEEPEST, Base, mean_of
 from torch_vdm.model.csf import barten, butterworth
 from torch_vdm.model.display import Display, linear_values
 from torch_vdm.model.distance import LARGEST_DIFFERENCE, Paths, accumulate
@@ -62,6 +62,8 @@ class Model:
         Results change by rounding only.
     cubes
         Whether the summation exponent is 6, and needs no gradient.
+    every_level
+        `all_levels`, where that is known.
     """
 
     def __init__(
@@ -74,6 +76,7 @@ class Model:
         steps: Steps = PLAIN,
         grey: bool = False,
         cubes: bool = False,
+        every_level: Levels | None = None,
     ) -> None:
         self.display = display
         self.observer = observer
@@ -82,6 +85,7 @@ class Model:
         self.constants = constants
         self.steps = steps
         self.cubes = cubes
+        self.every_level = every_level
         self.grey = self._of_grey() if grey else None
 
     # One image.
@@ -95,7 +99,8 @@ class Model:
         # Numbers are passed as tensors: compiled code is specialised on others.
         around = self.display.encoding, self.display.limit(image)
         if self.grey is not None:
-            one = image[:, :1]
+            # The mean where there may be a gradient, which all three channels then share.
+            one = image.mean(1, keepdim=True) if image.requires_grad else image[:, :1]
             return self.steps.pixels(lambda part: self.steps(linear_values, part, *around), one)
         matrix = self._to_cones()
         return self.steps.pixels(lambda part: self.steps(_light, part, *around, matrix), image)
@@ -117,19 +122,17 @@ class Model:
 
     def decomposed(self, planes: Tensor) -> Cortex:
         """Return the cortex representation of cone planes (B, 3, H, W)."""
-        return self.decomposed_of(self.filtered(planes), planes, mean_of(planes))
+        return self.decomposed_of(self.filtered(planes), planes)
 
-    def decomposed_of(
-        self, source: Tensor, planes: Tensor, mean: Tensor, grid: Grid | None = None
-    ) -> Cortex:
-        """Return the same from what is `filtered`, the light it comes from, and the light's mean.
+    def decomposed_of(self, source: Tensor, planes: Tensor, grid: Grid | None = None) -> Cortex:
+        """Return the same from what is `filtered`, and the light it comes from.
 
         ``grid``: that of a part of an image.
         """
         cortex = self.transform.decompose(source, self.steps, self.observer.true_means, grid=grid)
         if self.transform.csf == "levels":
             return cortex
-        light = Base(planes, 0, _size(planes), mean)
+        light = Base(planes, 0, _size(planes), mean_of(planes))
         return lowpass_of_light(cortex, light, self.observer.true_means)
 
     def filtered(self, planes: Tensor, coarser: Tensor | None = None, finest: int = 0) -> Tensor:
@@ -193,11 +196,11 @@ class Model:
         """Return the local visual difference (B, 1, h, w) of the level of this number."""
         details, others = first.details[number], second.details[number]
         sight, other_sight = (
-            sight.pushed(_size(details), first.items, first.before[number])
+            sight.pushed(_size(details), first.before[number])
             for sight in self.sights(level, (first, second), number)
         )
         images = details, others, sight, other_sight
-        return local_difference(*images, self.options(), self.steps, first.items)
+        return local_difference(*images, self.options(), self.steps)
 
     def nothing(self, image: Tensor) -> Tensor:
         """Return the `difference` of an image (1, 3, H, W) and itself."""
@@ -255,17 +258,16 @@ class Model:
         """Whether lowpass planes hold the quarters of nodes; see `lowpass_of_light`."""
         return self.transform.csf == "filter" and self.transform.shifts == 1
 
-    def descended(self, paths: Paths, before: Sequence[Before], items: int = 1) -> Tensor:
+    def descended(self, paths: Paths, before: Sequence[Before]) -> Tensor:
         """Return what has accumulated at the leaves of all paths, (B, 1, h, w)."""
-        charges = self.charges(paths.changes, items)
-        return accumulate(paths.local, paths.root, items, before, charges)
+        return accumulate(paths.local, paths.root, before, self.charges(paths.changes))
 
-    def charges(self, changes: Sequence[Tensor], items: int = 1) -> list[Charge] | None:
+    def charges(self, changes: Sequence[Tensor]) -> list[Charge] | None:
         """Return the shares that the nodes of each level are charged; None: all."""
         if not self.observer.charging:
             return None
-        options = self.transform.shifts, self.transform.csf == "filter", items, self.steps.cached
-        return [self.steps(charge, change, *options) for change in changes]
+        options = self.transform.shifts, self.transform.csf == "filter", self.steps
+        return [charge(change, *options) for change in changes]
 
     def grid(self, size: tuple[int, int]) -> Grid:
         """Return where the nodes lie on an image of ``size`` = (H, W) pixels."""
@@ -276,7 +278,7 @@ class Model:
         if self.transform.shifts > 1:  # the leaves of overlapping nodes are the pixels
             return plane
         grid = self.grid(size) if grid is None else grid
-        return push(plane, size, before=grid.before(0))
+        return push(plane, size, before=grid.before(0)).contiguous()
 
     # What a level depends on.
 
@@ -312,12 +314,18 @@ class Model:
         return constants, local, self.effects.chromatic, self.grey
 
     def levels(self, finest: int, count: int) -> Levels:
-        """Return what ``count`` levels respond to, from the level ``finest``; the coarsest first.
+        """Return what ``count`` levels respond to, the coarsest first; the finest is ``finest``."""
+        coarsest = finest + count
+        if self.every_level is None:
+            return self.all_levels(slice(finest, coarsest))
+        return Levels(*(part[DEEPEST - coarsest : DEEPEST - finest] for part in self.every_level))
+
+    def all_levels(self, some: slice = slice(None)) -> Levels:
+        """Return what all levels respond to, or some from the finest; the coarsest first.
 
         All levels at once: on small images, calling a level's operations costs more than their
         arithmetic.
         """
-        some = slice(finest, finest + count)
         frequency, gain = (self.constants[name][some].flip(0) for name in ("frequencies", "gains"))
         passed = self._passed(frequency[:, 0])
         return Levels(passed, frequency, gain, self._bright(frequency, gain))
@@ -348,7 +356,7 @@ class Model:
 
 def weights_alone(level: Level) -> Sight:
     """Return the channel weighting of a level of filtered images: details are contrasts already."""
-    return Sight(None, (1.0 / level.gain)[None, None])
+    return Sight(None, (1.0 / level.gain).unsqueeze(0))
 
 
 def _light(image: Tensor, encoding: str, limit: Tensor | None, matrix: Tensor) -> Tensor:

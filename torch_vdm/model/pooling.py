@@ -1,31 +1,6 @@
 """Spatial pooling, the eighth box of Fig. 2: neighbouring detectors add up."""
 
 from torch import Tensor
-from torch.nn import functional
-
-from torch_vdm.model.quadtree import apart, together
-
-
-def surround(responses: Tensor, items: int = 1) -> Tensor:
-    """Repeat the border of (B, channels, orientations, h, w) once on every side.
-
-    This is done for each of ``items`` stacked vertically; `within` removes it again.
-    """
-    planes = responses if items == 1 else apart(responses[0], items)
-    surrounded = functional.pad(planes, (1, 1, 1, 1, 0, 0), mode="replicate")
-    return surrounded if items == 1 else together(surrounded).unsqueeze(0)
-
-
-def within(pooled: Tensor, rows: int, items: int) -> Tensor:
-    """Return the ``rows`` of items that `surround` has padded and `pool` has pooled as one plane.
-
-    The shape goes from (1, 1, items (h + 2) - 2, w) to (1, 1, items h, w).
-    """
-    if items == 1 or pooled.shape[-2] == rows:
-        return pooled
-    # What lies between two items mixes both of them.
-    return together(apart(functional.pad(pooled, (0, 0, 0, 2)), items)[..., :-2, :].contiguous())
-
 
 # How many nodes `pool_sums` adds up.
 POOLED = 9.0
@@ -41,9 +16,9 @@ def pool_sums(surrounded: Tensor) -> Tensor:
 def pool(surrounded: Tensor) -> Tensor:
     """Return the mean of every node's 3x3 neighbourhood.
 
-    It is (..., h, w) from (B, channels, orientations, h + 2, w + 2), made by `surround`. The paper
-    prints the size of the filter (against Sarnoff's 5x5) but not its weights: equal ones are a
-    choice; a box of 3 nodes spans 2.2 cycles of its level, near the 2.5 of Wilson 1991.
+    It is (..., h, w) from (B, channels, orientations, h + 2, w + 2), which `surround` makes. The
+    paper prints the size of the filter (against Sarnoff's 5x5) but not its weights: equal ones are
+    a choice; a box of 3 nodes spans 2.2 cycles of its level, near the 2.5 of Wilson 1991.
     """
     return pool_sums(surrounded) / POOLED
 
@@ -58,14 +33,10 @@ def phase_energy(responses: Tensor, phases: int) -> Tensor:
     return energy.unflatten(2, (-1, phases)).mean(3) if phases > 1 else energy
 
 
-def surround_halves(energy: Tensor, nodes: int) -> Tensor:
-    """Repeat the border as `pool_halves` needs it for ``nodes`` nodes."""
-    sides = (nodes, nodes - 1, nodes, nodes - 1, 0, 0)
-    return functional.pad(energy, sides, mode="replicate")
-
-
 def pool_halves(surrounded: Tensor, nodes: int, dim: int) -> Tensor:
     """Return along ``dim``, for every half of a node, the sum over the nodes that cover it.
+
+    The border has to be repeated ``nodes`` times before and ``nodes`` - 1 times after the halves.
 
     Each half is covered by two overlapping nodes, and by ``nodes`` times as many when their
     neighbours are included. With 3 this is the 3x3 pooling of `pool` at each shift, averaged over

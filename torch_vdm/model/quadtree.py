@@ -4,7 +4,7 @@ A plane of h x w nodes has parents on a plane of ceil(h / 2) x ceil(w / 2) nodes
 node (x, y) is (x // 2, y // 2). A plane with an odd side is padded by repeating its last row or
 column, level by level: padding the whole image to a square power of two would cost twice the
 pixels at 1920 x 1080. Where a `Grid` puts a node before the first, there are ceil((h + 1) / 2), and
-the parent of x is (x + 1) // 2. Several trees may be stacked vertically in one plane.
+the parent of x is (x + 1) // 2.
 """
 
 from torch import Tensor
@@ -26,28 +26,24 @@ def pad_even(plane: Tensor) -> Tensor:
     return functional.pad(plane, (0, width % 2, 0, height % 2), mode="replicate")
 
 
-def stacked(batch: Tensor) -> Tensor:
-    """Return the items of a batch (B, C, h, w) stacked vertically, (1, C, B h, w)."""
-    return together(batch.transpose(0, 1)).unsqueeze(0)
+def surround(planes: Tensor, before: int = 1, after: int = 1) -> Tensor:
+    """Repeat the border of planes (B, ..., h, w).
+
+    It is repeated ``before`` times above and on the left, ``after`` times below and on the right.
+    """
+    if before == after == 0:
+        return planes
+    sides = before, after, before, after
+    # torch repeats the last three dimensions of five.
+    return functional.pad(planes, (*sides, *[0, 0] * (planes.ndim - 4)), mode="replicate")
 
 
-def apart(planes: Tensor, items: int) -> Tensor:
-    """Return what is stacked vertically, (..., items h, w), as (..., items, h, w)."""
-    items_apart: Tensor = planes.unflatten(-2, (items, -1))
-    return items_apart
-
-
-def together(planes: Tensor) -> Tensor:
-    """Return (..., items, h, w) stacked vertically, (..., items h, w): the inverse of `apart`."""
-    return planes.flatten(-3, -2)
-
-
-def push(nodes: Tensor, size: tuple[int, int], items: int = 1, before: Before = NONE) -> Tensor:
+def push(nodes: Tensor, size: tuple[int, int], before: Before = NONE) -> Tensor:
     """Give every child on a plane of ``size`` = (h, w) the value of its parent.
 
     ``nodes`` is (B, C, ..., ceil(h / 2), ceil(w / 2)), where h and w include what is put ``before``
-    the first child; the root's plane, 1 x 1, is also its own parent plane. With ``items`` trees
-    stacked vertically, ``size`` is that of all of them.
+    the first child; the root's plane, 1 x 1, is also its own parent plane. What is returned may be
+    a view.
     """
     if nodes.numel() <= SMALL and nodes.is_floating_point():
         twice = (*[1.0] * (nodes.ndim - 4), 2.0, 2.0)
@@ -56,10 +52,5 @@ def push(nodes: Tensor, size: tuple[int, int], items: int = 1, before: Before = 
         # Columns, then rows: faster than repeating elements along one axis and the other.
         rows = interleaved(nodes, nodes, -1).unsqueeze(-2)
         children = rows.expand(*rows.shape[:-2], 2, rows.shape[-1]).flatten(-3, -2)
-    if (children.shape[-2], children.shape[-1]) == size:
-        return children  # not a view: compiled code would be specialised on it
     top, left = before
-    bottom, right = top + size[0] // items, left + size[1]
-    if items > 1:
-        return together(apart(children, items)[..., top:bottom, left:right].contiguous())
-    return children[..., top:bottom, left:right].contiguous()
+    return children[..., top : top + size[0], left : left + size[1]]

@@ -21,6 +21,13 @@ class Steps:
         """Return what a pure function of planes returns; its first plane says how large it is."""
         return function(*arguments)
 
+    def valid(self, function: Callable[..., Any], around: Tensor, *arguments: Any) -> Any:
+        """Return what a pure function returns of planes that come with their neighbours.
+
+        Its planes are smaller by these, as those of a convolution that is called valid.
+        """
+        return function(around, *arguments)
+
     def pixels(self, function: Callable[..., Tensor], *planes: Tensor) -> Tensor:
         """Return the value of a pointwise function of pixels."""
         return function(*planes)

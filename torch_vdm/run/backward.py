@@ -17,7 +17,8 @@ from torch_vdm.model.distance import SMALLEST_DIFFERENCE
 from torch_vdm.model.level import Sight
 from torch_vdm.model.masking import masking_energy
 from torch_vdm.model.matrix import mix
-from torch_vdm.model.pooling import pool, surround
+from torch_vdm.model.pooling import pool
+from torch_vdm.model.quadtree import surround
 
 
 def local_difference_by_hand(

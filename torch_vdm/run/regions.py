@@ -17,7 +17,7 @@ from torch_vdm.precision import widest
 from torch_vdm.run.schedule import Schedule
 from torch_vdm.run.tiles import within_tile
 from torch_vdm.run.tiling import Slices, Tile, Tiling, cut
-from torch_vdm.run.whole import differences, level_difference
+from torch_vdm.run.whole import compared, level_difference
 
 # Levels that are computed in rectangles, from the finest. Status: choice, measured.
 LEVELS = 2
@@ -71,7 +71,7 @@ def accumulated(
         transform.rest(Base(planes, octaves, size, of_all), *options)
         for planes, of_all in zip((changed, plane), means, strict=True)
     ]
-    above = model.descended(differences(model, schedule, *coarse), coarse[0].before)
+    above = compared(model, schedule, *coarse)
     total = above.new_zeros(1, 1, *model.leaves(size))
     for tile, parts in fine:
         part = within_tile(model, tiling, tile, parts[::2], parts[1::2], above)

@@ -12,6 +12,7 @@ from torch.utils.checkpoint import checkpoint
 from torch_vdm.model.cortex import bands
 from torch_vdm.model.steps import Steps
 from torch_vdm.run.compiled import SMALLEST, compiled
+from torch_vdm.run.stacked import apart, below, rows_lost, unviewed
 from torch_vdm.run.tiling import Tiling, cut
 
 # Planes with more elements are computed in parts, which stay in a processor's cache. Status:
@@ -61,7 +62,7 @@ class Schedule(Steps):
     pieces: Literal["whole", "strips"] = "whole"
     """How the finest levels of an image are cut."""
     stacked: bool = False
-    """Whether the items of a batch are stacked vertically in planes of one."""
+    """Whether compiled steps get the items of a batch below one another."""
     together: bool = False
     """Whether both images are decomposed as one batch."""
     compiled: bool = False
@@ -80,9 +81,22 @@ class Schedule(Steps):
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return what a step returns, using its compiled form where that pays."""
-        if self.compiled and _first(arguments).numel() >= SMALLEST:
+        first = _first(arguments)
+        # A side that becomes 1 would need another form.
+        if not self.compiled or first.numel() < SMALLEST or first.shape[-2] < 3:
+            return function(*arguments)
+        items = first.shape[0]
+        if not self.stacked or items == 1:
             return compiled(function)(*arguments)
-        return function(*arguments)
+        return apart(compiled(function)(*below(arguments, items)), items)
+
+    def valid(self, function: Callable[..., Any], around: Tensor, *arguments: Any) -> Any:
+        """Return what a step returns of planes that come with their neighbours."""
+        items = around.shape[0]
+        if not self.compiled or not self.stacked or items == 1 or around.numel() < SMALLEST:
+            return self(function, around, *arguments)
+        found = compiled(function)(*below((around, *arguments), items))
+        return apart(found, items, rows_lost(around, found, items))
 
     def part(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return what several steps return; compiled graphs choose by themselves what they keep."""
@@ -93,10 +107,12 @@ class Schedule(Steps):
     def pixels(self, function: Callable[..., Tensor], *planes: Tensor) -> Tensor:
         """Return the value of a pointwise function of pixels, a few rows at a time."""
         if self.compiled:
-            return function(*planes)
+            # A user's image may be a part of another.
+            whole = (plane.clone() if plane.storage_offset() else plane for plane in planes)
+            return function(*(unviewed(plane, plane.shape) for plane in whole))
         if not self.cached:
-            whole: Tensor = self.part(function, *planes)
-            return whole
+            found: Tensor = self.part(function, *planes)
+            return found
         rows = self.rows(planes[0].shape[-2], planes[0].numel(), LARGEST_AT_ONCE)
         parts = zip(*(plane.split(rows, -2) for plane in planes), strict=True)
         return torch.cat([self.part(function, *part) for part in parts], -2)
@@ -135,7 +151,7 @@ def chosen(job: Job) -> Schedule:
             again=again,
             cached=False,
             # Levels computed at once keep all their intermediate results.
-            few=FEW_NODES if again else EVERY_LEVEL,
+            few=0 if job.traced else FEW_NODES if again else EVERY_LEVEL,
         )
     # With gradients strips take less memory and more time, as checkpoints do.
     large = math.prod(job.size) >= 2 * STRIP
@@ -147,21 +163,20 @@ def chosen(job: Job) -> Schedule:
         stacked=compiles and job.items > 1 and job.stackable,
         compiled=compiles,
         again=again,
+        # For sides that are symbols it is not known where nodes lie in a row.
+        few=0 if job.traced else FEW_NODES,
     )
 
 
 def at_once(job: Job) -> int:
     """Return how many items of a batch are computed at once.
 
-    Compiled code for one item serves a stacked batch. It has as many pixels as are not yet cut into
-    strips, and so few items that their planes of 2x2 nodes are not compiled: a side that becomes 1
-    would need another form.
+    Compiled code for one item serves a stacked batch, of as many pixels as are not yet cut into
+    strips.
     """
     if not job.compiles or job.traced:
         return job.items
-    if not job.stackable:
-        return 1
-    return min(max(1, 2 * STRIP // math.prod(job.size)), SMALLEST // 16)
+    return max(1, 2 * STRIP // math.prod(job.size)) if job.stackable else 1
 
 
 def _first(arguments: tuple[Any, ...]) -> Tensor:

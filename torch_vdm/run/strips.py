@@ -15,7 +15,7 @@ from torch_vdm.model.model import Model
 from torch_vdm.run import schedule as limits
 from torch_vdm.run.schedule import Schedule
 from torch_vdm.run.tiling import Tile, Tiling, cut
-from torch_vdm.run.whole import differences, level_difference
+from torch_vdm.run.whole import descended, differences, level_difference
 
 
 def can_be_cut(image: Tensor) -> bool:
@@ -93,4 +93,4 @@ def accumulated(model: Model, schedule: Schedule, test: Tensor, reference: Tenso
         (*paths.changes, *fine[1::kinds]) if charging else (),
         paths.root,
     )
-    return model.descended(paths, grid.down(len(paths.local)))
+    return descended(model, schedule, paths, grid.down(len(paths.local)))

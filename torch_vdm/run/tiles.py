@@ -18,14 +18,14 @@ from torch import Tensor
 from torch_vdm.model.charging import AROUND
 from torch_vdm.model.cortex import Cortex, bands
 from torch_vdm.model.cortex.haar import lowpass_of_light
-from torch_vdm.model.cortex.transform import Base, mean_of
+from torch_vdm.model.cortex.transform import Base
 from torch_vdm.model.distance import accumulate, just_noticeable
 from torch_vdm.model.grid import Grid
 from torch_vdm.model.model import Model
 from torch_vdm.precision import widest
 from torch_vdm.run.schedule import Schedule
 from torch_vdm.run.tiling import Slices, Source, Tile, Tiling, check_sources, cut, read
-from torch_vdm.run.whole import differences
+from torch_vdm.run.whole import compared, descended, differences
 
 # Called with the number of steps done, and the number of all steps.
 Progress = Callable[[int, int], None]
@@ -109,8 +109,7 @@ def in_tiles(
             contrasts = _coarse_contrasts(model, schedule, read_part, plain, step)
         if not tiling.whole:
             representations = _coarse(model, schedule, read_part, tiling, contrasts, step)
-            before = representations[0].before
-            coarse = model.descended(differences(model, schedule, *representations), before)
+            coarse = compared(model, schedule, *representations)
         for tile in tiling:
             around = _around(tile, tiling, contrasts)
             planes, seen = read_part(around.part)
@@ -121,7 +120,7 @@ def in_tiles(
             paths = differences(model, schedule, first, second)
             part_grid = tiling.grid_of(tile.part)
             if coarse is None:
-                total = model.descended(paths, first.before)
+                total = descended(model, schedule, paths, first.before)
                 yield Done(item, tile.part, part_grid, total, seen)
                 step()
                 continue
@@ -162,10 +161,10 @@ def _decomposed(
     model: Model, planes: Tensor, coarser: Tensor | None, part: Slices | None, grid: Grid
 ) -> Cortex:
     """Return the cortex representation of a ``part`` of cone planes, or of all."""
-    source, mean = model.filtered(planes, coarser), mean_of(planes)
+    source = model.filtered(planes, coarser)
     if part is not None:
         source, planes = cut(source, part), cut(planes, part)
-    return model.decomposed_of(source, planes, mean, grid)
+    return model.decomposed_of(source, planes, grid)
 
 
 def _coarse_contrasts(

@@ -1,16 +1,14 @@
-"""Whole planes, level by level; the coarsest levels at once, with their nodes in a row."""
+"""Whole planes, level by level; the coarsest levels at once, with their nodes in a column."""
 
-import itertools
-import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from torch_vdm.model.charging import changes
+from torch_vdm.model.charging import AROUND, Charge, changes, charge_within
 from torch_vdm.model.cortex import Cortex, Haar
-from torch_vdm.model.distance import Paths
+from torch_vdm.model.distance import Paths, accumulate
+from torch_vdm.model.grid import Before
 from torch_vdm.model.level import (
     Level,
     Levels,
@@ -19,37 +17,33 @@ from torch_vdm.model.level import (
     pooled_difference,
     response_difference,
     response_difference_at,
-    surrounded,
+    summed_across,
 )
 from torch_vdm.model.model import Model, weights_alone
-from torch_vdm.model.pooling import within
-from torch_vdm.model.quadtree import apart, push, stacked
 from torch_vdm.run import schedule as limits
 from torch_vdm.run.backward import by_hand, local_difference_by_hand
+from torch_vdm.run.column import Column, cells_of, column_of
 from torch_vdm.run.schedule import Schedule
 
 
 def accumulated(model: Model, schedule: Schedule, test: Tensor, reference: Tensor) -> Tensor:
     """Return `Model.difference` of two images, (B, 1, h, w)."""
-    if schedule.together and model.transform.csf == "levels":
-        planes = torch.cat([model.cone_planes(image) for image in (test, reference)])
-        return compared(model, schedule, *_halves(model.decomposed(planes)))
-    if not schedule.stacked:
+    if not schedule.together or model.transform.csf != "levels":
         first, second = model.represent(test), model.represent(reference)
         return compared(model, schedule, first, second)
-    # Stacked vertically: compiled code for one image serves a batch.
-    options, items = (schedule, model.observer.true_means), len(test)
-    first, second = (
-        Haar().decompose(model.cone_planes(stacked(image)), *options, items)
-        for image in (test, reference)
-    )
-    return apart(compared(model, schedule, first, second)[0], items).transpose(0, 1)
+    planes = torch.cat([model.cone_planes(image) for image in (test, reference)])
+    return compared(model, schedule, *_halves(model.decomposed(planes)))
 
 
 def compared(model: Model, schedule: Schedule, first: Cortex, second: Cortex) -> Tensor:
     """Return the accumulated differences (B, 1, h, w) of two representations."""
-    paths = differences(model, schedule, first, second)
-    return model.descended(paths, first.before, first.items)
+    return descended(model, schedule, differences(model, schedule, first, second), first.before)
+
+
+def descended(model: Model, schedule: Schedule, paths: Paths, before: Sequence[Before]) -> Tensor:
+    """Return `Model.descended`, computing what the coarsest levels are charged at once."""
+    charges = _charges(model, schedule, paths.changes, before) if model.observer.charging else None
+    return accumulate(paths.local, paths.root, before, charges)
 
 
 def differences(model: Model, schedule: Schedule, first: Cortex, second: Cortex) -> Paths:
@@ -63,7 +57,7 @@ def local_differences(
 ) -> tuple[Tensor, ...]:
     """Return `Model.local_differences`, dropping the responses of a level once they are used."""
     levels = model.levels(first.finest, len(first.details))
-    few = _few(schedule, first)
+    few = _few(schedule, first.details)
     return (
         *_of_few(model, schedule, first, second, few, levels),
         *(
@@ -78,9 +72,9 @@ def level_difference(
 ) -> Tensor:
     """Return `Model.local_difference` of a level."""
     details, others = first.details[number], second.details[number]
-    items, options = first.items, model.options()
+    options = model.options()
     sight, other_sight = (
-        sight.pushed(_size(details), items, first.before[number])
+        sight.pushed(_size(details), first.before[number])
         for sight in model.sights(level, (first, second), number)
     )
     # One orientation at a time where the planes are large and no orientation masks another:
@@ -91,7 +85,7 @@ def level_difference(
         at_once = options.phases if large else orientations
 
     def of(one: Tensor, other: Tensor, sight: Sight, other_sight: Sight) -> Tensor:
-        return local_difference(one, other, sight, other_sight, options, schedule, items)
+        return local_difference(one, other, sight, other_sight, options, schedule)
 
     # Where the gradient is worked out by hand, nothing needs to be kept.
     fixed = options.matrix, options.transducer_exponent, options.summation_exponent
@@ -101,8 +95,8 @@ def level_difference(
         and options.masking
         and options.pooled > 1
         and model.transform == Haar()
+        and model.grey is None
         and not schedule.compiled
-        and items == 1
         and not any(constant.requires_grad for constant in fixed)
     )
     local = []
@@ -124,55 +118,80 @@ def level_difference(
 def _of_few(
     model: Model, schedule: Schedule, first: Cortex, second: Cortex, few: int, levels: Levels
 ) -> list[Tensor]:
-    """Return the local visual differences of the ``few`` coarsest levels, with nodes in a row."""
+    """Return the local visual differences of the ``few`` coarsest levels, in a column."""
     if few == 0:
         return []
-    items, options = first.items, model.options()
-    sizes = [_size(detail) for detail in first.details[:few]]
-    nodes = [math.prod(size) for size in sizes]
-    details = _in_a_row(first.details[:few]), _in_a_row(second.details[:few])
-    level = levels.in_a_row(nodes)
+    options = model.options()
+    column = _column(first.details[:few], first.before, first.windows or first.lowpass)
+    details = [column.of(cortex.details[:few]) for cortex in (first, second)]
+    level = levels.in_a_column(column.level)
+    difference = _column_difference(model, schedule, (first, second), column, details, level)
+    cells = cells_of(column.sizes, options.ring, difference)
+    around = summed_across(cells.of(difference), options, schedule)
+    return cells.planes(schedule.valid(pooled_difference, around, options))
+
+
+def _column_difference(
+    model: Model,
+    schedule: Schedule,
+    images: Sequence[Cortex],
+    column: Column,
+    details: Sequence[Tensor],
+    level: Level,
+) -> Tensor:
+    """Return the `difference_of` two images' responses at the nodes in a column."""
+    options = model.options()
     if model.transform.csf == "filter":
         sight = weights_alone(level)
-        difference = response_difference(details[0], details[1], sight, sight, options)
-    else:
-        # Both images in one batch: nothing is computed here.
-        images = first, second
-        parents = _in_a_row(
-            push(
-                torch.cat([cortex.parent_lowpass(number) for cortex in images]),
-                size,
-                items,
-                first.before[number],
-            )
-            for number, size in enumerate(sizes)
-        )
-        both = [parent.clone() for parent in parents.chunk(2)]
-        seen_at = (both, level, *model.sight_options())
-        difference = schedule(response_difference_at, *details, seen_at, options)
-    around = [surrounded(plane, options, items=items) for plane in _planes(difference, sizes)]
-    # Side by side along the longer axis, which needs the least padding.
-    along = -1 if sizes[-1][0] <= sizes[-1][1] else -2
-    gathered: Tensor = schedule(pooled_difference, _joined(around, along), options)
-    starts = itertools.accumulate((plane.shape[along] for plane in around), initial=0)
-    local = []
-    for start, plane, (rows, columns) in zip(starts, around, sizes, strict=False):
-        # The padding around the items is still between them.
-        long = rows + (items - 1) * (plane.shape[-1] - columns)
-        part = gathered.narrow(along, start, (long, columns)[along])[..., :long, :columns]
-        local.append(within(part, rows, items))
-    return local
+        return response_difference(details[0], details[1], sight, sight, options)
+    # All but the finest of these levels have the parents of others.
+    most = max(len(column.sizes) - 1, 1)
+    parents = [
+        column.of_parents(column.of((cortex.windows or cortex.lowpass)[:most])) for cortex in images
+    ]
+    seen_at = parents, level, *model.sight_options()
+    difference: Tensor = schedule(response_difference_at, *details, seen_at, options)
+    return difference
+
+
+def _column(
+    planes: Sequence[Tensor], before: Sequence[Before], parents: Sequence[Tensor] = ()
+) -> Column:
+    """Return the column of the levels that planes (..., h, w) belong to, the coarsest first.
+
+    ``parents``: the planes that hold the parents of their nodes.
+    """
+    sizes, above = (tuple(map(_size, each)) for each in (planes, parents[: len(planes)]))
+    return column_of(sizes, before[: len(planes)], planes[0], above)
+
+
+def _charges(
+    model: Model, schedule: Schedule, changes: Sequence[Tensor], before: Sequence[Before]
+) -> list[Charge]:
+    """Return `Model.charges`, of the coarsest levels at once."""
+    few = _few(schedule, changes)
+    coarse: list[Charge] = []
+    if few:
+        column = _column(changes[:few], before)
+        shifts, filtered = model.transform.shifts, model.transform.csf == "filter"
+        cells = cells_of(column.sizes, (AROUND * shifts, AROUND * shifts), changes[0])
+        around = cells.of(column.of(changes[:few]))
+        inherited, own = charge_within(around, shifts, filtered, schedule.cached)
+        owns = [None] * few if own is None else cells.planes(own)
+        coarse = list(map(Charge, cells.planes(inherited), owns))
+    return coarse + (model.charges(changes[few:]) or [])
 
 
 def _changes(model: Model, schedule: Schedule, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
     """Return `Model.changes`, computing those of the coarsest levels at once."""
     if not model.observer.charging:
         return ()
-    few = 0 if model.quartered else _few(schedule, first)
+    few = 0 if model.quartered else _few(schedule, first.details)
     coarse: list[Tensor] = []
     if few:
-        rows = changes(*(_in_a_row(cortex.lowpass[:few]) for cortex in (first, second)))
-        coarse = _planes(rows, [_size(detail) for detail in first.details[:few]])
+        column = _column(first.lowpass[:few], first.before)
+        changed = changes(*(column.of(cortex.lowpass[:few]) for cortex in (first, second)))
+        coarse = column.planes(changed)
     fine = range(few, len(first.details))
     return (*coarse, *(model.change(first, second, number) for number in fine))
 
@@ -183,35 +202,10 @@ def _halves(both: Cortex) -> Iterator[Cortex]:
         yield both.each(lambda plane, half=half: plane.chunk(2)[half])
 
 
-def _few(schedule: Schedule, cortex: Cortex) -> int:
+def _few(schedule: Schedule, planes: Sequence[Tensor]) -> int:
     """Return how many levels, from the coarsest, are computed at once."""
-    return sum(math.prod(_size(detail)) <= schedule.few for detail in cortex.details)
+    return sum(plane.shape[-2] * plane.shape[-1] <= schedule.few for plane in planes)
 
 
 def _size(plane: Tensor) -> tuple[int, int]:
     return plane.shape[-2], plane.shape[-1]
-
-
-def _in_a_row(planes: Iterable[Tensor]) -> Tensor:
-    """Return the nodes of planes (..., h, w) in a row, (..., 1, all of them)."""
-    return torch.cat([plane.flatten(-2).unsqueeze(-2) for plane in planes], -1)
-
-
-def _planes(row: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Tensor]:
-    """Return the planes (..., h, w) of nodes in a row, (..., 1, all of them)."""
-    parts = row.squeeze(-2).split([math.prod(size) for size in sizes], -1)
-    return [part.unflatten(-1, size) for part, size in zip(parts, sizes, strict=True)]
-
-
-def _joined(planes: Sequence[Tensor], along: int) -> Tensor:
-    """Return planes (..., h, w) joined into one along the last or the last but one dimension.
-
-    The other dimension is that of the longest; shorter ones are padded with zeros.
-    """
-    lengths = [plane.shape[-3 - along] for plane in planes]
-    padded = []
-    for plane, length in zip(planes, lengths, strict=True):
-        rest = max(lengths) - length
-        sides = (0, 0, 0, rest) if along == -1 else (0, rest)
-        padded.append(functional.pad(plane, sides) if rest else plane)
-    return torch.cat(padded, along)

@@ -39,15 +39,22 @@ class Pair(NamedTuple):
 INSIDE = Pair(0.5, 0.5, 0.5)
 
 
-class Weights(NamedTuple):
-    """The same for all n pairs along a side, as tensors."""
+class Across(NamedTuple):
+    """The weights of all n pairs along w."""
 
-    own: Tensor
-    """(n,)."""
-    completed: Tensor
-    """(n,)."""
+    weights: Tensor
+    """(1, 3, 1, n): w of the mean of their own pixels, w of that for the details, and h."""
+    on_right: Tensor
+    """(1, 3, 1, 1): what the right one counts for beside the difference of the two, 1, 1 and 0."""
+
+
+class Down(NamedTuple):
+    """The weights of all n pairs along h."""
+
+    weights: Tensor
+    """(1, 3, n, 1): w of the mean of their own pixels, and twice that for the details."""
     half: Tensor
-    """(n,)."""
+    """(1, 1, n, 1): h of the details."""
 
 
 def is_inside(side: Side, nodes: int) -> bool:
@@ -79,9 +86,7 @@ def ends(side: Side, nodes: int) -> tuple[Pair, Pair]:
     return begin, end
 
 
-def weights(
-    sides: tuple[Side, Side], nodes: tuple[int, int], like: Tensor
-) -> tuple[Weights, Weights]:
+def weights(sides: tuple[Side, Side], nodes: tuple[int, int], like: Tensor) -> tuple[Down, Across]:
     """Return the weights of every pair along h and along w, for so many nodes each.
 
     They have the precision and the device of ``like``.
@@ -93,20 +98,24 @@ def weights(
 
 
 @lru_cache(maxsize=512)
-def _kept(*of: Any) -> tuple[Weights, Weights]:
+def _kept(*of: Any) -> tuple[Down, Across]:
     with torch.inference_mode(False):
         return _made(*of)
 
 
 def _made(
     sides: tuple[Side, Side], nodes: tuple[int, int], dtype: torch.dtype, device: torch.device
-) -> tuple[Weights, Weights]:
-    # Never one tensor for both, even if they are equal: compiled code is specialised on that.
-    down, across = (
-        Weights(*(torch.tensor(row, dtype=dtype, device=device) for row in _rows(side, count)))
-        for side, count in zip(sides, nodes, strict=True)
+) -> tuple[Down, Across]:
+    # Never one tensor for two, nor views: compiled code is specialised on that.
+    def tensor(of: Any) -> Tensor:
+        return torch.tensor(of, dtype=dtype, device=device)
+
+    (own, completed, half), across = (_rows(side, n) for side, n in zip(sides, nodes, strict=True))
+    down = [[[weight] for weight in row] for row in (own, completed, completed)]
+    return (
+        Down(tensor([down]), tensor([[[[weight] for weight in half]]])),
+        Across(tensor([[[row] for row in across]]), tensor([[[[1.0]], [[1.0]], [[0.0]]]])),
     )
-    return down, across
 
 
 def _rows(side: Side, nodes: int) -> list[tuple[float, ...]]:
@@ -131,34 +140,28 @@ def with_siblings(plane: Tensor, sides: tuple[Side, Side]) -> Tensor:
     return functional.pad(plane, (left, right, top, bottom), mode="reflect")
 
 
-def analyse_at_border(
-    even: Tensor, down: Weights, across: Weights
-) -> tuple[Tensor, Tensor, Tensor]:
+def analyse_at_border(even: Tensor, down: Down, across: Across) -> tuple[Tensor, Tensor, Tensor]:
     """Return the lowpass, the details and the means of the windows of planes `with_siblings`.
 
     They are (B, C, h, w), (B, C, 3, h, w) and (B, C, h, w). ``down`` and ``across`` are the weights
     of the pairs along h and w.
     """
-    left, right = even[..., 0::2], even[..., 1::2]
-    between = left - right
-    own = torch.addcmul(right, across.own, between)
-    # The mean across is for d2, the detail for d1 and d3.
-    mean, detail = torch.addcmul(right, across.completed, between), across.half * between
-    down = Weights(*(weight.unsqueeze(-1) for weight in down))
-    top, bottom = own[..., 0::2, :], own[..., 1::2, :]
-    lowpass = torch.addcmul(bottom, down.own, top - bottom)
-    top, bottom = detail[..., 0::2, :], detail[..., 1::2, :]
+    left, right = even[..., 0::2].unsqueeze(2), even[..., 1::2].unsqueeze(2)
+    # Across: the mean of their own pixels, that for d2 and the window, the detail for d1 and d3.
+    both = torch.addcmul(right * across.on_right, across.weights, left - right)
+    top, bottom = both[..., 0::2, :], both[..., 1::2, :]
     between = top - bottom
-    horizontal, diagonal = torch.addcmul(bottom, down.completed, between), down.half * between
-    bottom = mean[..., 1::2, :]
-    between = mean[..., 0::2, :] - bottom
-    window = torch.addcmul(bottom, down.completed, between)
-    return lowpass, torch.stack((horizontal, down.half * between, diagonal), 2), window
+    means = torch.addcmul(bottom, down.weights, between)
+    details = torch.cat((means[:, :, 2:], down.half * between[:, :, 1:]), 2)
+    lowpass, window = means[:, :, 0], means[:, :, 1]
+    if torch.compiler.is_compiling():  # compiled code is specialised on views
+        return lowpass.contiguous(), details, window.contiguous()
+    return lowpass, details, window
 
 
-def means_at_border(even: Tensor, down: Weights, across: Weights) -> tuple[Tensor]:
+def means_at_border(even: Tensor, down: Down, across: Across) -> tuple[Tensor]:
     """Return the lowpass of `analyse_at_border` alone."""
     left, right = even[..., 0::2], even[..., 1::2]
-    own = torch.addcmul(right, across.own, left - right)
+    own = torch.addcmul(right, across.weights[:, :1], left - right)
     top, bottom = own[..., 0::2, :], own[..., 1::2, :]
-    return (torch.addcmul(bottom, down.own.unsqueeze(-1), top - bottom),)
+    return (torch.addcmul(bottom, down.weights[:, :1], top - bottom),)

@@ -3,13 +3,14 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from torch_vdm.model.cortex.border import (
-    Weights,
+    Across,
+    Down,
     analyse_at_border,
     is_inside,
     means_at_border,
@@ -18,7 +19,7 @@ from torch_vdm.model.cortex.border import (
 )
 from torch_vdm.model.cortex.transform import CSF, DEEPEST, Base, Cortex, checked_csf, mean_of
 from torch_vdm.model.grid import PAPERS, Grid, thirds
-from torch_vdm.model.quadtree import apart, pad_even, together
+from torch_vdm.model.quadtree import pad_even
 from torch_vdm.model.steps import PLAIN, Steps
 
 # The exponent of the sum over coefficients in which a diagonal grating is made as strong as a
@@ -65,7 +66,6 @@ class Haar:
         planes: Tensor,
         steps: Steps = PLAIN,
         true_means: bool = False,
-        items: int = 1,
         *,
         grid: Grid | None = None,
     ) -> Cortex:
@@ -73,16 +73,15 @@ class Haar:
 
         ``true_means``: a node at the border counts for the pixels that it has. Otherwise it counts
         for as many as its siblings, as the repeated last row or column of an odd side makes it.
-        ``items``: how many images are stacked vertically. ``grid``: that of a part of an image.
+        ``grid``: that of a part of an image.
 
         Returns
         -------
         Cortex
             ``details[l]`` is (B, C, 3, h, w): d1 (horizontal), d2 (vertical), d3 (diagonal).
         """
-        size = (planes.shape[-2] // items, planes.shape[-1])
-        base = Base(planes, 0, size, mean_of(planes, items))
-        return self.coarser(base, steps, true_means, items=items, grid=grid)
+        size = (planes.shape[-2], planes.shape[-1])
+        return self.coarser(Base(planes, 0, size, mean_of(planes)), steps, true_means, grid=grid)
 
     def begin(
         self,
@@ -132,7 +131,6 @@ class Haar:
         steps: Steps = PLAIN,
         true_means: bool = False,
         count: int = DEEPEST,
-        items: int = 1,
         grid: Grid | None = None,
     ) -> Cortex:
         """Return the levels of `decompose`, at most ``count``, without its ``base.octaves`` finest.
@@ -142,9 +140,9 @@ class Haar:
         plane, octaves, size, mean = base
         if grid is None:
             grid = self.grid(size, true_means)
-        found = levels(plane, octaves, size, steps, true_means, grid, count, items)
+        found = levels(plane, octaves, size, steps, true_means, grid, count)
         details, lowpass, windows = (tuple(reversed(planes)) for planes in found)
-        return Cortex(details, lowpass or (plane,), mean, octaves, items, grid, windows or None)
+        return Cortex(details, lowpass or (plane,), mean, octaves, grid, windows or None)
 
     def peak(self, level_from_finest: int) -> tuple[float, float]:
         """Return the best frequency of a level, in cycles/pixel, and the gain there."""
@@ -170,24 +168,14 @@ def levels(
     true_means: bool,
     grid: Grid,
     count: int = DEEPEST,
-    items: int = 1,
 ) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
     """Return details, lowpass and windows of the ``count`` finest levels, the finest first.
 
     ``planes`` (B, C, h, w) are the means of nodes of 2^octaves pixels a side, placed by ``grid`` on
-    an image of ``size`` = (H, W) pixels; or (1, C, items h, w) for ``items`` of them.
+    an image of ``size`` = (H, W) pixels.
     """
     found = _descended(
-        planes,
-        octaves,
-        size,
-        true_means,
-        grid,
-        count,
-        steps,
-        _analyse,
-        analyse_at_border,
-        items,
+        planes, octaves, size, true_means, grid, count, steps, _analyse, analyse_at_border
     )
     # Away from the border a window is the node.
     windows = [window[0] if window else lowpass for lowpass, _, *window in found]
@@ -235,31 +223,20 @@ def _descended(
     count: int,
     steps: Steps,
     inside: Callable[[Tensor], tuple[Tensor, ...]],
-    at_border: Callable[[Tensor, Weights, Weights], tuple[Tensor, ...]],
-    items: int = 1,
+    at_border: Callable[[Tensor, Down, Across], tuple[Tensor, ...]],
 ) -> list[tuple[Tensor, ...]]:
     """Return what a function gives for a plane of even sides, the lowpass first, level by level.
 
     ``inside`` is a function of whole nodes alone; ``at_border`` one that knows which are not whole.
     """
-
-    def each(function: Callable[..., Tensor], *planes: Tensor) -> Tensor:
-        """Apply a function to every item separately."""
-        if items == 1:
-            return function(*planes)
-        return together(function(*(apart(plane[0], items) for plane in planes))).unsqueeze(0)
-
     found: list[tuple[Tensor, ...]] = []
-    while (nodes := (planes.shape[-2] // items, planes.shape[-1])) != (1, 1) and len(found) < count:
+    while (nodes := (planes.shape[-2], planes.shape[-1])) != (1, 1) and len(found) < count:
         sides = grid.sides(size, octaves + len(found))
         if not true_means or (not steps.fused and all(map(is_inside, sides, nodes))):
-            planes, *details = steps(inside, each(pad_even, planes))
+            planes, *details = steps(inside, pad_even(planes))
         else:
-            even = each(partial(with_siblings, sides=sides), planes)
-            down, across = weights(sides, nodes, planes)
-            if items > 1:
-                down = Weights(*(weight.repeat(items) for weight in down))
-            planes, *details = steps(at_border, even, down, across)
+            even = with_siblings(planes, sides)
+            planes, *details = steps(at_border, even, *weights(sides, nodes, planes))
         found.append((planes, *details))
     return found
 

@@ -6,7 +6,6 @@ from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
 from torch import Tensor
 
 from torch_vdm.model.grid import PAPERS, Before, Grid
-from torch_vdm.model.quadtree import apart, together
 from torch_vdm.model.steps import PLAIN, Steps
 from torch_vdm.options import choice
 from torch_vdm.precision import widest
@@ -39,8 +38,6 @@ class Cortex(NamedTuple):
         repeated border of an odd side may count for too much.
     finest
         How many levels finer than these the image has; see `Transform.resume`.
-    items
-        How many images are stacked vertically in every plane; if there are several, B is 1.
     grid
         Where the nodes lie on the image.
     windows
@@ -52,7 +49,6 @@ class Cortex(NamedTuple):
     lowpass: tuple[Tensor, ...]
     mean: Tensor
     finest: int = 0
-    items: int = 1
     grid: Grid = PAPERS
     windows: tuple[Tensor, ...] | None = None
 
@@ -201,15 +197,11 @@ class Transform(Protocol):
         """
 
 
-def mean_of(planes: Tensor, items: int = 1) -> Tensor:
+def mean_of(planes: Tensor) -> Tensor:
     """Return the mean (B, C, 1, 1) of (B, C, H, W), good to its last bit at any size.
-
-    For ``items`` images stacked vertically, (1, C, items H, W), that of each, (1, C, items, 1).
 
     The lowpass term multiplies the difference of two means by 76 and more: the rounding of a sum
     over millions of pixels would be visible.
     """
     rows = planes.mean(-1, keepdim=True).to(widest(planes.device))
-    if items > 1:
-        return together(apart(rows, items).mean(-2, keepdim=True)).to(planes)
     return rows.mean(-2, keepdim=True).to(planes)
