@@ -266,7 +266,7 @@ def render(
         if resume is not None:
             run.go_on(Path(resume))
         if run.plan.integrator is not None:
-            renderer.simulate(run.plan.max_depth)
+            renderer.simulate(run.plan.max_depth, run.plan.found_by)
         with (
             _threads(run.threads),
             _told(watch or Watch(), tolerance) as told,

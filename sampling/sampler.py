@@ -267,9 +267,14 @@ class Sampler:
     @property
     def variance(self) -> Plane:
         """(H, W, 3), the estimated variance of ``image``."""
-        single = pooled_covariance(self._statistics, self.size)[FIRST == SECOND]
-        variance: Plane = np.moveaxis(single, 0, -1) / np.maximum(self.count, 1)[..., None]
+        variance: Plane = self.single_variance / np.maximum(self.count, 1)[..., None]
         return variance
+
+    @property
+    def single_variance(self) -> Plane:
+        """(H, W, 3), the estimated variance of a single sample."""
+        single = pooled_covariance(self._statistics, self.size)[FIRST == SECOND]
+        return np.moveaxis(single, 0, -1)
 
     def state(self) -> dict[str, Any]:
         """Return all that a continuation needs: a flat dict of arrays, numbers, strings and None.
