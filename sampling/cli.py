@@ -351,6 +351,8 @@ def _text(figures: dict[str, Any], options: argparse.Namespace) -> str:
             "black: no sample has met any light; look at the scene's lights and at what its "
             "sensor sees"
         )
+    elif figures["grey"]:
+        lines.append("grey: all samples are, so that decisions took one plane in place of three")
     plan = figures["plan"]
     depth = "no limit of depth" if plan["max_depth"] is None else f"depth {plan['max_depth']}"
     simulated = [each["effect"] for each in plan["effects"] if each["simulated"]]

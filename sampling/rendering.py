@@ -521,6 +521,7 @@ class _Run:
             "nonfinite": report.nonfinite if report is not None else 0,
             "pixels_empty": empty,
             "black": not sampler.image.any(),
+            "grey": sampler.grey,
             "unbiased": identity["unbiased"],
             "width": width,
             "height": height,

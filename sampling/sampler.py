@@ -26,7 +26,7 @@ StopReason = Literal["tolerance", "noise_threshold", "max_spp"]
 StrategyName = Literal["perceptual", "objective", "uniform", "halfbuffer"]
 
 # Version of `state`, raised when an older state would be continued differently.
-STATE_VERSION = 8
+STATE_VERSION = 9
 
 # Share of the tolerance that a round aims at, since a prediction is not exact. Status: choice.
 AIM = 0.98
@@ -252,7 +252,16 @@ class Sampler:
 
         ``part`` has what is left out of each sample so far; see `Model.largest_without`.
         """
-        return Model(self.metric, self._statistics, self.size).largest_without(part)
+        grey = self.grey and part.grey()
+        return Model(self.metric, self._statistics, self.size, grey=grey).largest_without(part)
+
+    @property
+    def grey(self) -> bool:
+        """Whether all samples so far are grey, so that one plane is decided on in place of three.
+
+        It changes decisions by rounding only.
+        """
+        return self._statistics.grey()
 
     @property
     def image(self) -> Plane:
