@@ -13,7 +13,7 @@ scene that asks for no longer ones.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
 
@@ -258,8 +258,11 @@ class Pilot:
         self._held.append(found)
         return found.samples
 
-    def settle(self) -> None:
-        """Decide on the cut and on what finds light, after the first decision of the sampler."""
+    def settle(self, look: Callable[[], None] = lambda: None) -> None:
+        """Decide on the cut and on what finds light, after the first decision of the sampler.
+
+        ``look`` is called before each long piece of work; what it raises ends the decision.
+        """
         report, held = self.sampler.report(), self._held
         assert report is not None
         self._held = []
@@ -272,20 +275,22 @@ class Pilot:
         if cut is not None:
             rest = Statistics(report.jnd.size, halves=False)
             for samples, within, *_ in held:
+                look()
                 rest.add(Samples(samples.pixels, samples.radiance - within))
-            bound = self.sampler.largest_without(rest)
+            bound = self.sampler.largest_without(rest, look)
             if not self._may_be_missing(cut, bound):
                 return
-        chosen = self._of([each.within for each in held], held)
+        chosen = self._of([each.within for each in held], held, look)
         times = 1.0
         if found_by != BOTH:
-            alone = self._of([each.alone for each in held], held)
+            alone = self._of([each.alone for each in held], held, look)
             times = self._times_the_samples(chosen, alone, held)
             found_by = self._paying(found_by, times)
             if found_by != BOTH:
                 chosen = alone
             else:
                 times = 1.0
+        look()
         cost = times * self._rays[found_by] * _dearer(bound / self._tolerance)
         if cost <= WORTH:
             self._simulate(cut, found_by, bound, chosen)
@@ -296,10 +301,16 @@ class Pilot:
                 "samples than that saves"
             )
 
-    def _of(self, light: list[NDArray[np.float32]], held: list[Bounced]) -> Sampler:
+    def _of(
+        self,
+        light: list[NDArray[np.float32]],
+        held: list[Bounced],
+        look: Callable[[], None],
+    ) -> Sampler:
         """Return a sampler that has the pilot's samples with other light."""
         sampler = Sampler(self._renderer.size, self._metric, self.sampler.settings)
         for each, radiance in zip(held, light, strict=True):
+            look()
             sampler.tell(Samples(each.samples.pixels, radiance))
         return sampler
 

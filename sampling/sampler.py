@@ -247,13 +247,15 @@ class Sampler:
         """Return the report of the last decision; None before the pilot is complete."""
         return self._report
 
-    def largest_without(self, part: Statistics) -> float:
+    def largest_without(self, part: Statistics, look: Callable[[], None] = lambda: None) -> float:
         """Return the visible difference that leaving out a part of the light makes, JND.
 
-        ``part`` has what is left out of each sample so far; see `Model.largest_without`.
+        ``part`` has what is left out of each sample so far; see `Model.largest_without`. ``look``
+        is as in `ask`.
         """
         grey = self.grey and part.grey()
-        return Model(self.metric, self._statistics, self.size, grey=grey).largest_without(part)
+        model = Model(self.metric, self._statistics, self.size, look, grey)
+        return model.largest_without(part)
 
     @property
     def grey(self) -> bool:

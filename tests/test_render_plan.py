@@ -446,6 +446,43 @@ def test_interrupted_anywhere_the_same_bits(
     assert resumed.figures["plan"] == whole.figures["plan"]
 
 
+class EndsTheJudging(Watch):
+    """Ends a run at once, while its pilot is judged."""
+
+    judging = False
+
+    def presses(self) -> int:
+        """Return 2 while it is."""
+        return 2 if self.judging else 0
+
+
+def test_interrupted_while_the_pilot_is_judged(
+    dim: tuple[Path, sampling.Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (path, whole), kept, watch = dim, tmp_path / "kept.npz", EndsTheJudging()
+    settle = plans.Pilot.settle
+
+    def judged(self: plans.Pilot, *look: Any) -> None:
+        watch.judging = True
+        settle(self, *look)
+
+    def waited(*_: Any) -> None:
+        raise AssertionError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(plans.Pilot, "settle", judged)
+        # The longest piece of its work is not begun.
+        patch.setattr(Sampler, "largest_without", waited)
+        ended = sampling.render(path, **OPTIONS, checkpoint=kept, watch=watch)
+    assert ended.stop_reason == "interrupted"
+    assert ended.report is not None
+    assert ended.figures["plan"]["left_out"] == []
+    # What the plan would have been is not known: the same bits need the pilot again.
+    with pytest.warns(UserWarning, match="within the first round, of which nothing is kept"):
+        resumed = sampling.render(path, **OPTIONS, resume=kept)
+    np.testing.assert_array_equal(resumed.image, whole.image)
+
+
 class EndsItsRound(Watch):
     """Ends a run with the round that it is in."""
 
