@@ -122,6 +122,11 @@ class LocalErrors:
         image for three.
     leaves
         (1, C, H, W), float32: the variances of the pixels with which others are compared.
+
+    Attributes
+    ----------
+    own
+        What `at` returns for ``leaves``.
     """
 
     def __init__(self, metric: VDM, truth: Cortex, leaves: Tensor) -> None:
@@ -147,11 +152,19 @@ class LocalErrors:
             )
             for number in range(few, len(nodes))
         ]
-        self._variances = detail_variances(leaves, metric.observer.true_means)[few:]
+        variances = detail_variances(leaves, metric.observer.true_means)
+        self._variances = variances[few:]
         self._kept = [
             self._computed(level, variance)
             for level, variance in zip(self._levels, self._variances, strict=True)
         ]
+        self.own: tuple[Tensor, ...] = (
+            *local_errors(metric, self._coarse, variances[:few], leaves),
+            *(
+                kept[..., level.before[0] :, level.before[1] :]
+                for level, kept in zip(self._levels, self._kept, strict=True)
+            ),
+        )
 
     def at(self, leaves: Tensor, pays: float = PAYS) -> tuple[Tensor, ...]:
         """Return the local errors, as `local_errors`, for these variances of pixels, (1, C, H, W).

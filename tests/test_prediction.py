@@ -15,6 +15,7 @@ from sampling.prediction import (
     SHARPNESS,
     SOFTNESS,
     Model,
+    _around,
     _factor,
     _shrunk,
     _textured,
@@ -75,6 +76,13 @@ def test_a_detail_is_never_enlarged_and_noise_is_taken_away() -> None:
     texture = 10.0 + noise
     assert float((_shrunk(texture, one, PLACING_DOUBT) / texture).min()) > 0.5
     torch.testing.assert_close(_shrunk(texture, 0.0 * one, PLACING_DOUBT), texture)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 5), (33, 64)], ids=str)
+def test_means_of_neighbours_are_pytorchs_bit_for_bit(size: tuple[int, int]) -> None:
+    plane = torch.rand(2, 3, 3, *size, generator=torch.Generator().manual_seed(3)) ** 9
+    expected = torch.nn.functional.avg_pool2d(plane.flatten(1, 2), 3, 1, 1, count_include_pad=False)
+    assert torch.equal(_around(plane), expected.view(plane.shape))
 
 
 def test_a_texture_in_noise_keeps_its_contrast_and_a_plain_node_beside_it_has_none() -> None:

@@ -138,6 +138,15 @@ class Sight(NamedTuple):
         return Sight(self.scale, self.sensitivity[:, :, orientations])
 
 
+def pushed(
+    sights: Sequence[Sight], size: tuple[int, int], items: int = 1, before: Before = NONE
+) -> list[Sight]:
+    """Return two images' channel weightings `Sight.pushed`; one that both share only once."""
+    one, other = sights
+    first = one.pushed(size, items, before)
+    return [first, first if other is one else other.pushed(size, items, before)]
+
+
 class Options(NamedTuple):
     """What the boxes of a level depend on besides details and channel weightings."""
 

@@ -17,6 +17,7 @@ from torch_vdm.model.level import (
     Sight,
     local_difference,
     pooled_difference,
+    pushed,
     response_difference,
     response_difference_at,
     surrounded,
@@ -79,10 +80,8 @@ def level_difference(
     """Return `Model.local_difference` of a level."""
     details, others = first.details[number], second.details[number]
     items, options = first.items, model.options()
-    sight, other_sight = (
-        sight.pushed(_size(details), items, first.before[number])
-        for sight in model.sights(level, (first, second), number)
-    )
+    sights = model.sights(level, (first, second), number)
+    sight, other_sight = pushed(sights, _size(details), items, first.before[number])
     # One orientation at a time where the planes are large and no orientation masks another:
     # intermediate results then stay in the cache. Compiled code keeps none.
     at_once = orientations = details.shape[2]
