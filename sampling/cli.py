@@ -16,7 +16,7 @@ from typing import Any
 from sampling import cluster
 from sampling.renderers.filter import FILTERS, SCENE
 from sampling.renderers.mitsuba import VARIANTS
-from sampling.rendering import EFFECTS, Result, Watch, render, seen, terminal
+from sampling.rendering import EFFECTS, FEW_PIXELS, Result, Watch, render, seen, terminal
 from sampling.sampler import Report
 from sampling.strategies import STRATEGIES
 from torch_vdm import __version__
@@ -267,7 +267,7 @@ def _rendered(options: argparse.Namespace, sensor: int | str, number: int | None
             result.save_checkpoint(kept)
     result.figures["scene"] = str(options.scene)
     result.figures["written"] = [str(path) for path in (output, checkpoint) if path is not None]
-    result.figures["reproduce"] = _reproduce(options)
+    result.figures["reproduce"] = _reproduce(options, result.figures)
     return result
 
 
@@ -296,9 +296,11 @@ def _warned() -> Iterator[None]:
         yield
 
 
-def _reproduce(options: argparse.Namespace) -> str:
+def _reproduce(options: argparse.Namespace, figures: dict[str, Any]) -> str:
     """Return the command that gives the same image, with nothing left to defaults."""
     words = ["vdm-render", str(options.scene), "--output", str(options.output)]
+    if figures["width"] * figures["height"] >= FEW_PIXELS:  # the last bits depend on it
+        words = [f"OMP_NUM_THREADS={figures['threads']}", *words]
     for name in ("strategy", "tolerance", "max_spp", "time_limit", "noise_threshold", "seed"):
         value = getattr(options, name)
         if value is not None:
@@ -351,6 +353,8 @@ def _text(figures: dict[str, Any], options: argparse.Namespace) -> str:
             "black: no sample has met any light; look at the scene's lights and at what its "
             "sensor sees"
         )
+    elif figures["grey"]:
+        lines.append("grey: all samples are, so that decisions took one plane in place of three")
     plan = figures["plan"]
     depth = "no limit of depth" if plan["max_depth"] is None else f"depth {plan['max_depth']}"
     simulated = [each["effect"] for each in plan["effects"] if each["simulated"]]

@@ -3,7 +3,9 @@
 First the scene is read: without media no volumetric integrator is needed, and where no surface
 scatters, no light has been reflected twice. Then a pilot measures what each further bounce of light
 adds, and the metric judges whether anyone could see it. What is left out has a bound in JND, and
-the noise may use only the rest of the tolerance: both together stay within it.
+the noise may use only the rest of the tolerance: both together stay within it. The pilot also
+measures whether rays aimed at lights alone, or rays that materials scatter alone, would do with
+less work than both, which gives the same picture with other noise.
 
 The pilot is the first round of the run, and its samples stay in the picture. Where nothing is left
 out, the picture is that of ``--effects full``, bit for bit; where paths are cut, it is that of a
@@ -11,7 +13,7 @@ scene that asks for no longer ones.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
 
@@ -20,6 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from sampling.renderers import Samples
+from sampling.renderers.bounces import BOTH, LIGHTS, MATERIALS
 from sampling.renderers.mitsuba import Bounced, MitsubaRenderer
 from sampling.renderers.needs import PATH, Needs
 from sampling.sampler import Request, Sampler, Settings
@@ -35,11 +38,11 @@ SHARE = 0.25
 CUTS = (2, 3, 4, 6, 8, 12)
 
 # Fewest samples per pixel from which a pilot can tell anything. Fewest pixels, because its code
-# takes a quarter of a second to compile, and most pixels, because it is kept in memory, 576 bytes
+# takes a quarter of a second to compile, and most pixels, because it is kept in memory, 768 bytes
 # each. Status: choices.
 FEWEST_SAMPLES, FEWEST_PIXELS, MOST_PIXELS = 16, 2**18, 2**20
 
-# Before the pilot, one sample each of about so many pixels tells whether a cut could save anything
+# Before the pilot, two samples each of about so many pixels tell whether a cut could save anything
 # and would not obviously show. The mean of the picture decides that, with a factor because some
 # places differ more. Status: choice; a bound was 4 to 10 times the mean's difference on dim rooms
 # and open scenes.
@@ -51,6 +54,20 @@ STEEP = 2.3
 
 # The rest must cost at most this share, or everything is kept. Status: choice.
 WORTH = 0.95
+
+# Lights or materials alone must cost at most this share of both. Status: choice.
+WORTH_ALONE = 0.9
+
+# Standard deviation of a sample, of its mean, that is added to all noise before noises are
+# compared: what less of it does is not seen, and may not decide. Status: choice.
+FAINT = 0.01
+
+# How light is found, in words.
+WORDS = {
+    BOTH: "rays aimed at lights and rays that materials scatter",
+    LIGHTS: "rays aimed at lights",
+    MATERIALS: "rays that materials scatter",
+}
 
 # Paths that compiled code follows together, until the longest has ended. Status: choice, as with
 # AVX-512; the same on every machine, because the image must not depend on it.
@@ -76,6 +93,8 @@ class Plan:
     """What was considered and kept, with reasons."""
     evidence: dict[str, Any]
     """What was measured: figures by name."""
+    found_by: str = BOTH
+    """What finds light: `BOTH`, `LIGHTS` or `MATERIALS`; the last two with ``integrator`` alone."""
 
     @classmethod
     def of(cls, kept: str) -> Self:
@@ -99,6 +118,7 @@ class Plan:
             "left_out": list(self.left_out),
             "kept": list(self.kept),
             "left_out_jnd": self.bound,
+            "light_found_by": self.found_by,
             "evidence": self.evidence,
         }
 
@@ -160,7 +180,8 @@ def _volumetric(needs: Needs) -> str | None:
 
 def _unpiloted(needs: Needs, settings: Settings, size: tuple[int, int]) -> str | None:
     """Return why every bounce is kept without a pilot; None: a pilot is to decide."""
-    if needs.max_depth is not None and needs.max_depth <= CUTS[0]:
+    lit = needs.scatters or needs.passes or needs.unread
+    if needs.max_depth is not None and (needs.max_depth < CUTS[0] or not lit):
         return f"paths of {needs.max_depth} segments, as the scene has it"
     if not needs.tellable:
         return "every bounce: only compiled variants in RGB tell them apart"
@@ -181,10 +202,10 @@ def _unpiloted(needs: Needs, settings: Settings, size: tuple[int, int]) -> str |
 
 
 class Pilot:
-    """The first round of a run, with the light separated by bounces.
+    """The first round of a run, with the light separated by bounces and by what finds it.
 
     ``steps`` draws it for the sampler of the run, as it would be drawn without a plan. After the
-    sampler's first decision, ``settle`` decides what is cut.
+    sampler's first decision, ``settle`` decides what is cut, and what finds light.
 
     Parameters
     ----------
@@ -198,8 +219,8 @@ class Pilot:
     Attributes
     ----------
     plan, sampler
-        Those given, until ``settle``. With a cut the sampler is another one, which has the pilot's
-        samples without what is cut, and continues as if the scene had never asked for more.
+        Those given, until ``settle``. Where less is to be simulated the sampler is another one,
+        which has the pilot's samples as they then are, and continues as if the run had begun so.
     """
 
     def __init__(self, plan: Plan, renderer: MitsubaRenderer, sampler: Sampler) -> None:
@@ -208,10 +229,14 @@ class Pilot:
         self._renderer = renderer
         self._metric = sampler.metric
         self._tolerance = sampler.settings.tolerance
-        self._depth = renderer.needs.max_depth
-        # The depth of a possible cut, and the share of all segments that it leaves.
+        needs = renderer.needs
+        self._depth = needs.max_depth
+        self._ways = (BOTH, LIGHTS) if needs.sharp_lights else (BOTH, LIGHTS, MATERIALS)
+        # The depth of a possible cut, what may find light, and the share of all rays that is left
+        # with the cut, by what finds light.
         self._cut: int | None = None
-        self._cost = 1.0
+        self._found_by = BOTH
+        self._rays = dict.fromkeys(self._ways, 1.0)
         self._held: list[Bounced] = []
 
     def steps(self) -> Iterator[int]:
@@ -225,47 +250,98 @@ class Pilot:
             yield part.samples
 
     def _drawn(self, part: Request) -> Samples:
-        """Draw a part, and keep its light with the cut, if there may be one."""
+        """Draw a part, and keep what its light would be, if it may be simulated otherwise."""
         which = part.pixels, part.first, part.count
-        if self._cut is None:
+        if self._cut is None and self._found_by == BOTH:
             return self._renderer.sample(*which)
-        found = self._renderer.sample_bounces(*which, self._cut)
+        found = self._renderer.sample_bounces(*which, self._cut, self._found_by)
         self._held.append(found)
         return found.samples
 
-    def settle(self) -> None:
-        """Decide on the cut, after the first decision of the sampler."""
-        report, cut, held = self.sampler.report(), self._cut, self._held
+    def settle(self, look: Callable[[], None] = lambda: None) -> None:
+        """Decide on the cut and on what finds light, after the first decision of the sampler.
+
+        ``look`` is called before each long piece of work; what it raises ends the decision.
+        """
+        report, held = self.sampler.report(), self._held
         assert report is not None
         self._held = []
-        if cut is None:
+        if not held:
             return
         if report.forecast <= report.samples:
-            self._keep("every bounce: the run is too short for a cut to save anything")
+            self._keep("every bounce, and all rays: the run is too short to save anything")
             return
-        short = Sampler(self._renderer.size, self._metric, self.sampler.settings)
-        rest = Statistics(report.jnd.size, halves=False)
-        for samples, within, _ in held:
-            short.tell(Samples(samples.pixels, within))
-            rest.add(Samples(samples.pixels, samples.radiance - within))
-        self._judge(cut, short, self.sampler.largest_without(rest))
+        cut, found_by, bound = self._cut, self._found_by, 0.0
+        if cut is not None:
+            rest = Statistics(report.jnd.size, halves=False)
+            for samples, within, *_ in held:
+                look()
+                rest.add(Samples(samples.pixels, samples.radiance - within))
+            bound = self.sampler.largest_without(rest, look)
+            if not self._may_be_missing(cut, bound):
+                return
+        chosen = self._of([each.within for each in held], held, look)
+        times = 1.0
+        if found_by != BOTH:
+            alone = self._of([each.alone for each in held], held, look)
+            times = self._times_the_samples(chosen, alone, held)
+            found_by = self._paying(found_by, times)
+            if found_by != BOTH:
+                chosen = alone
+            else:
+                times = 1.0
+        look()
+        cost = times * self._rays[found_by] * _dearer(bound / self._tolerance)
+        if cost <= WORTH:
+            self._simulate(cut, found_by, bound, chosen)
+        elif cut is not None:
+            self._keep(
+                f"every bounce: paths of at most {cut} segments would cost "
+                f"{self._rays[found_by]:.0%}, and the {bound:.2g} JND that may be missing more "
+                "samples than that saves"
+            )
+
+    def _of(
+        self,
+        light: list[NDArray[np.float32]],
+        held: list[Bounced],
+        look: Callable[[], None],
+    ) -> Sampler:
+        """Return a sampler that has the pilot's samples with other light."""
+        sampler = Sampler(self._renderer.size, self._metric, self.sampler.settings)
+        for each, radiance in zip(held, light, strict=True):
+            look()
+            sampler.tell(Samples(each.samples.pixels, radiance))
+        return sampler
 
     def _glance(self) -> None:
-        """Find a cut that may save something and may not show, by one sample of some pixels.
+        """Find what may save something and may not show, by two samples of some pixels.
 
-        The mean of the picture alone must not show it: no difference is less than that of the mean.
+        The mean of the picture alone must not show a cut: no difference is less than that of the
+        mean.
         """
         pixels = np.arange(math.prod(self._renderer.size))
         # Packets of neighbouring pixels, as they are drawn.
         pixels = pixels[pixels // LANES % max(len(pixels) // GLANCED, 1) == 0]
-        ones, most = np.ones_like(pixels), SHARE * self._tolerance / LOCAL
+        twice, most = np.full_like(pixels, 2), SHARE * self._tolerance / LOCAL
         reason = "every bounce: paths end early by themselves, and a cut would save too little"
+
+        def drawn(cut: int | None) -> tuple[Bounced, dict[str, float], str, float]:
+            """Return samples, the shares of rays, the way with the least cost, and that cost."""
+            found = self._renderer.sample_bounces(pixels, 0 * twice, twice, cut)
+            rays = {way: _cost(found.rays_within[way], found.rays) for way in self._ways}
+            costs = {way: rays[way] * _glanced_noise(found, way) for way in self._ways}
+            way = min(costs, key=costs.__getitem__)
+            if not costs[way] <= WORTH_ALONE * costs[BOTH]:
+                way = BOTH
+            return found, rays, way, costs[way]
+
+        _, self._rays, self._found_by, whole = drawn(None)
         for cut in CUTS:
             if self._depth is not None and cut >= self._depth:
                 break
-            found = self._renderer.sample_bounces(pixels, 0 * ones, ones, cut)
-            self._cost = _cost(found.segments, cut)
-            if self._cost > WORTH:
+            found, rays, way, cost = drawn(cut)
+            if not cost <= WORTH * whole:
                 break
             shown = self._of_means(_mean(found.samples.radiance), _mean(found.within))
             if shown > most:
@@ -273,11 +349,13 @@ class Pilot:
                     f"every bounce: without paths of more than {cut} segments the mean of the "
                     f"picture alone would differ by {shown:.2g} JND, of {most:.2g} that may be"
                 )
-            elif self._cost * _dearer(shown / self._tolerance) <= WORTH:
-                self._cut = cut
+            elif cost * _dearer(shown / self._tolerance) <= WORTH * whole:
+                self._cut, self._found_by, self._rays = cut, way, rays
                 break
         if self._cut is None:
             self._keep(reason)
+        if self._found_by == BOTH:
+            self._keep(f"{WORDS[BOTH]}: neither alone would find light with less work")
         if self._renderer.aov_sums is not None:
             self._renderer.aov_sums[:] = 0.0
 
@@ -287,42 +365,94 @@ class Pilot:
         with torch.no_grad():
             return float(self._metric(*pair).amax())
 
-    def _judge(self, cut: int, short: Sampler, bound: float) -> None:
-        """Decide on a cut that shows by at most ``bound`` JND."""
-        tolerance, most, cost = self._tolerance, SHARE * self._tolerance, self._cost
-        evidence = {
-            "segments": cut,
-            "left_out_jnd": bound,
-            "left_out_jnd_most": most,
-            "share_of_segments": cost,
-            "samples_per_pixel": short.settings.pilot,
-        }
-        self.plan = replace(self.plan, evidence=evidence)
+    def _may_be_missing(self, cut: int, bound: float) -> bool:
+        """Decide whether what a cut leaves out, at most ``bound`` JND, may be missing."""
+        most = SHARE * self._tolerance
+        self._measured(
+            segments=cut,
+            left_out_jnd=bound,
+            left_out_jnd_most=most,
+            share_of_rays=self._rays[BOTH],
+            samples_per_pixel=self.sampler.settings.pilot,
+        )
         if bound > most:
             self._keep(
                 f"every bounce: without paths of more than {cut} segments {bound:.2g} JND may be "
                 f"missing, of {most:.2g} that may be"
             )
-        elif cost * _dearer(bound / tolerance) > WORTH:
-            self._keep(
-                f"every bounce: paths of at most {cut} segments would cost {cost:.0%}, and the "
-                f"{bound:.2g} JND that may be missing more samples than that saves"
-            )
-        else:
-            left = (
+        return bound <= most
+
+    def _times_the_samples(self, both: Sampler, alone: Sampler, held: list[Bounced]) -> float:
+        """Return how many times the samples light needs that is found in one way alone.
+
+        Each pixel weighs as many samples as the first decision wants of it, and needs them in
+        proportion to its variance. That of the one way is told in two ways, of which the worse
+        counts: by its own samples, and by the moments that both kinds of rays give, which know of
+        light that its own samples have not met yet.
+        """
+        request = self.sampler.ask()
+        assert request is not None
+        wanted = np.full(self.sampler.count.size, self.sampler.settings.pilot, np.float64)
+        wanted[request.pixels] = request.first + request.count
+        count = np.maximum(both.count.reshape(-1), 1)
+        excess = np.zeros(len(wanted))
+        for each in held:
+            told = each.excess[self._found_by]
+            excess += np.bincount(each.samples.pixels, told, len(wanted))
+        variance, of_alone = (each.single_variance.sum(-1).reshape(-1) for each in (both, alone))
+        faint = (FAINT**2 * both.image**2).sum(-1).reshape(-1)
+        return max(
+            _noisier(variance, variance + excess / count, faint, wanted),
+            _noisier(variance, of_alone, faint, wanted),
+        )
+
+    def _paying(self, found_by: str, times: float) -> str:
+        """Return what is to find light, if one way alone needs so many times the samples."""
+        rays = self._rays[found_by] / self._rays[BOTH]
+        self._measured(
+            light_considered=found_by,
+            times_the_samples=times if math.isfinite(times) else None,
+            rays_of_those_of_both=rays,
+        )
+        if times * rays <= WORTH_ALONE:
+            return found_by
+        self._keep(
+            f"{WORDS[BOTH]}: {WORDS[found_by]} alone would need {times:.2g} times the samples, of "
+            f"{rays:.0%} of the rays"
+        )
+        return BOTH
+
+    def _simulate(self, cut: int | None, found_by: str, bound: float, chosen: Sampler) -> None:
+        """Adopt what is to be simulated, and the sampler that has the pilot's samples so."""
+        left = list(self.plan.left_out)
+        if cut is not None:
+            left.append(
                 f"paths of more than {cut} segments: at most {bound:.2g} JND, of which the noise "
                 "gets nothing"
             )
-            self.plan = replace(
-                self.plan,
-                integrator=PATH,
-                max_depth=cut,
-                bound=bound,
-                left_out=(*self.plan.left_out, left),
+        if found_by != BOTH:
+            other = MATERIALS if found_by == LIGHTS else LIGHTS
+            times = self.plan.evidence["times_the_samples"]
+            left.append(
+                f"{WORDS[other]} to find light: {WORDS[found_by]} alone give the same picture, "
+                f"with {times:.2g} times the samples and "
+                f"{self._rays[found_by] / self._rays[BOTH]:.0%} of the rays"
             )
-            short.settings = replace(short.settings, tolerance=tolerance - bound)
-            self.sampler = short
-            self._renderer.simulate(cut)
+        depth = self._depth if cut is None else cut
+        self.plan = replace(
+            self.plan,
+            integrator=PATH,
+            max_depth=depth,
+            bound=bound,
+            left_out=tuple(left),
+            found_by=found_by,
+        )
+        chosen.settings = replace(chosen.settings, tolerance=self._tolerance - bound)
+        self.sampler = chosen
+        self._renderer.simulate(depth, found_by)
+
+    def _measured(self, **figures: Any) -> None:
+        self.plan = replace(self.plan, evidence=self.plan.evidence | figures)
 
     def _keep(self, reason: str) -> None:
         self.plan = replace(self.plan, kept=(*self.plan.kept, reason))
@@ -335,13 +465,50 @@ def _mean(light: NDArray[np.float32]) -> NDArray[np.float64]:
     return mean
 
 
-def _cost(segments: NDArray[np.float32], cut: int) -> float:
-    """Return the share of all segments that are followed with a cut.
+def _cost(part: NDArray[np.float32], rays: NDArray[np.float32]) -> float:
+    """Return the share of all rays that is traced where each sample traces a part of them.
 
     It is a count, not a time: the same run must decide the same.
     """
-    packets = np.pad(segments, (0, -len(segments) % LANES)).reshape(-1, LANES).max(1)
-    return float(np.minimum(packets, cut).sum() / max(float(packets.sum()), 1.0))
+    packets = (
+        np.pad(each, (0, -len(each) % LANES)).reshape(-1, LANES).max(1).sum(dtype=np.float64)
+        for each in (part, rays)
+    )
+    most, all_rays = packets
+    return float(most / max(all_rays, 1.0))
+
+
+def _glanced_noise(found: Bounced, found_by: str) -> float:
+    """Return about how many times the samples ``found_by`` needs, by two samples of each pixel.
+
+    Neighbours in a packet are taken together.
+    """
+    if found_by == BOTH:
+        return 1.0
+    light = found.within.reshape(-1, 2, 3).astype(np.float64)
+    variance = (np.diff(light, axis=1) ** 2).sum((1, 2)) / 2.0
+    excess = found.excess[found_by].reshape(-1, 2).mean(1, dtype=np.float64)
+    faint = (FAINT**2 * light.mean(1) ** 2).sum(1)
+    own, more, faint = (
+        np.pad(each, (0, -len(each) % LANES)).reshape(-1, LANES).sum(1)
+        for each in (variance, excess, faint)
+    )
+    return _noisier(own, own + more, faint, np.ones_like(own))
+
+
+def _noisier(
+    before: NDArray[np.float64],
+    after: NDArray[np.float64],
+    faint: NDArray[np.float64],
+    weight: NDArray[np.float64],
+) -> float:
+    """Return the weighted mean of the ratio of two variances, each with a ``faint`` one added."""
+    before, after = before + faint, after + faint
+    dark = before <= 0.0
+    ratio = np.where(dark, np.where(after > 0.0, np.inf, 1.0), after / np.where(dark, 1.0, before))
+    mean = float((weight * ratio).sum() / weight.sum())
+    # Not each by itself: few samples may tell of less than no variance.
+    return math.inf if math.isnan(mean) else max(mean, 0.0)
 
 
 def _dearer(share: float) -> float:

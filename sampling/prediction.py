@@ -65,6 +65,9 @@ AT_ONCE = 2**18
 class Model:
     """The statistics of a round, as the metric sees them.
 
+    Where all samples are grey, it computes with one plane (C = 1) in place of S, M and L (C = 3),
+    which changes results by rounding only.
+
     Parameters
     ----------
     metric
@@ -75,6 +78,8 @@ class Model:
         Height and width.
     look
         Called before each long piece of work; it may raise to end the work early.
+    grey
+        Whether all samples are grey; None: as the statistics say.
     """
 
     def __init__(
@@ -83,6 +88,7 @@ class Model:
         statistics: Statistics,
         size: tuple[int, int],
         look: Callable[[], None] = lambda: None,
+        grey: bool | None = None,
     ) -> None:
         self.metric = metric
         self._look = look
@@ -96,7 +102,9 @@ class Model:
         self.mean = torch.from_numpy(statistics.mean.reshape(1, 3, *size))
         self.true_means = metric.observer.true_means
         self.exponent = metric.observer.summation_exponent
-        self.to_cones = _to_cones(metric)
+        self.grey = statistics.grey() if grey is None else grey
+        # From samples to the planes that are compared, (C, 3).
+        self.to_cones = _first_channel() if self.grey else _to_cones(metric)
         # The variance of a single sample, and of their mean.
         self.single_variance = self._cone_variance()
         self.variance = self.single_variance / torch.from_numpy(self.count)
@@ -105,7 +113,7 @@ class Model:
         # Variances of the details, which are estimated from them in single precision.
         self.details = detail_variances(self.variance.float(), self.true_means)
         with torch.no_grad():
-            self.cortex = self._lit(metric.represent(self.mean))
+            self.cortex = self._lit(metric.represent(self.mean, self.grey))
         self.truth = self._estimated(partial(_shrunk, doubt=PLACING_DOUBT))
 
     def totals(self, count: NDArray[np.float64] | None = None) -> Tensor:
@@ -120,9 +128,10 @@ class Model:
     @cached_property
     def _now(self) -> Tensor:
         """The totals for the samples so far, by the boundary images without correction."""
-        return self._uncorrected(None)
+        self._look()
+        return _finest(self.errors.own, self.cortex.grid)
 
-    def _uncorrected(self, count: NDArray[np.float64] | None) -> Tensor:
+    def _uncorrected(self, count: NDArray[np.float64]) -> Tensor:
         self._look()
         return _finest(self.errors.at(self.leaves(count)), self.cortex.grid)
 
@@ -140,7 +149,7 @@ class Model:
         return most * math.pow(float(((totals / most) ** power).sum()), 1.0 / power)
 
     def leaves(self, count: NDArray[np.float64] | None = None) -> Tensor:
-        """Return the variance of each pixel for `errors`, (1, 3, H, W), in single precision.
+        """Return the variance of each pixel for `errors`, (1, C, H, W), in single precision.
 
         With ``count``, (H, W), it is what the variance would be if each pixel had that many
         samples.
@@ -238,9 +247,7 @@ class Model:
             In JND. Where a quarter of the draws lie above it on average, the rest is skipped: the
             run does not end yet, and only at the end must the prediction be good.
         """
-        factor = _factor(torch.from_numpy(self.single / self.count))
-        # From normal deviates directly to S, M, L.
-        mixing = torch.einsum("ij,jkhw->ikhw", self.to_cones, factor).float()
+        mixing = self._mixing(self.single)
         generator = torch.Generator().manual_seed(0)
         height, width = self.size
         if draws is None:
@@ -257,7 +264,7 @@ class Model:
             self._look()
             batch = min(step, draws - len(largest))
             normal = torch.randn(batch, 3, height, width, generator=generator, dtype=torch.float32)
-            noise = mix(mixing, normal)
+            noise = mix(mixing, normal[:, : len(mixing)])
             added = self.metric.transform.decompose(noise, true_means=self.true_means)
             # Samples are placed by the plain image, for which a quarter of the draws is enough.
             if len(largest) < few:
@@ -283,8 +290,7 @@ class Model:
             Statistics of the part of each sample that is left out, of as many samples as
             ``statistics`` has.
         """
-        factor = _factor(torch.from_numpy(pooled_covariance(part, self.size) / self.count))
-        mixing = torch.einsum("ij,jkhw->ikhw", self.to_cones, factor).float()
+        mixing = self._mixing(pooled_covariance(part, self.size))
         mean = torch.from_numpy(part.mean.reshape(3, *self.size))
         known = torch.einsum("ij,jhw->ihw", self.to_cones, mean).float()
         generator = torch.Generator().manual_seed(0)
@@ -292,11 +298,21 @@ class Model:
         largest = np.empty(FEWEST_DRAWS)
         for number in range(FEWEST_DRAWS):
             self._look()
-            normal = torch.randn(1, *known.shape, generator=generator, dtype=torch.float32)
-            missing = known + mix(mixing, normal)
+            normal = torch.randn(1, 3, *self.size, generator=generator, dtype=torch.float32)
+            missing = known + mix(mixing, normal[:, : len(mixing)])
             totals = seen(self.metric.transform.decompose(-missing, true_means=self.true_means))
             largest[number] = float(totals.amax()) ** (1.0 / self.exponent)
         return _upper(largest)
+
+    def _mixing(self, single: NDArray[np.float64]) -> Tensor:
+        """Return the matrices from normal deviates to S, M, L, (C, C, H, W), float32.
+
+        ``single``, (6, H, W): the covariance of single samples. The first deviate makes the noise
+        of grey samples: the images are those that three planes would have.
+        """
+        factor = _factor(torch.from_numpy(single / self.count))
+        mixing = torch.einsum("ij,jkhw->ikhw", self.to_cones, factor).float()
+        return mixing[:, : len(mixing)].contiguous()
 
     def _judge(self, truth: Cortex) -> Callable[[Cortex], Tensor]:
         """Return a function that gives the totals, (B, 1, h, w), of noises added to an image."""
@@ -335,7 +351,7 @@ class Model:
         return _upper(self.simulated(tolerance=tolerance))
 
     def _cone_variance(self) -> Tensor:
-        """Return the variance of a single sample of each pixel in S, M, L, (1, 3, H, W).
+        """Return the variance of a single sample of each pixel in S, M, L, (1, C, H, W).
 
         It is clamped to `LARGEST`.
         """
@@ -363,6 +379,11 @@ def _to_cones(metric: VDM) -> Tensor:
     if metric.display.encoding == "xyz":
         return cones
     return cones @ metric.get_buffer("primaries").double().cpu() * metric.display.gain
+
+
+def _first_channel() -> Tensor:
+    """Return the matrix from grey samples to the one plane that stands for them, (1, 3)."""
+    return torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
 
 
 def _shrunk(detail: Tensor, variance: Tensor, doubt: float) -> Tensor:
@@ -418,10 +439,21 @@ def _least(energy: Tensor) -> Tensor:
 
 
 def _around(plane: Tensor) -> Tensor:
-    """Return the mean over 3x3 nodes of (B, C, 3, h, w); fewer at the border."""
-    flat = plane.flatten(1, 2)
-    mean = functional.avg_pool2d(flat, 3, 1, 1, count_include_pad=False)
-    return mean.view(plane.shape)
+    """Return the mean over 3x3 nodes of (B, C, 3, h, w); fewer at the border.
+
+    The additions are those of `avg_pool2d`, bit for bit, in half of its time.
+    """
+    height, width = plane.shape[-2:]
+
+    def sums(nodes: Tensor) -> Tensor:
+        around = functional.pad(nodes, (1, 1, 1, 1))
+        total = torch.zeros_like(nodes)
+        for y in range(3):
+            for x in range(3):
+                total += around[..., y : y + height, x : x + width]
+        return total
+
+    return sums(plane) / sums(torch.ones_like(plane[0, 0, 0]))
 
 
 def _factor(covariance: Tensor) -> Tensor:

@@ -210,7 +210,8 @@ def render(
     ------
     ValueError
         With a message of one line, if an option is out of its range, the scene cannot be rendered
-        (`SceneError`), or a checkpoint is of another run or cannot be written (`CheckpointError`).
+        (`SceneError`), or a checkpoint is of another run, or that of an interrupted run cannot be
+        written (`CheckpointError`).
     """
     begun = time.monotonic()
     # NumPy numbers cannot be written as JSON.
@@ -266,7 +267,7 @@ def render(
         if resume is not None:
             run.go_on(Path(resume))
         if run.plan.integrator is not None:
-            renderer.simulate(run.plan.max_depth)
+            renderer.simulate(run.plan.max_depth, run.plan.found_by)
         with (
             _threads(run.threads),
             _told(watch or Watch(), tolerance) as told,
@@ -274,7 +275,7 @@ def render(
             told.begin()
             reason = run.until_done(told, time_limit or np.inf, checkpoint)
         if checkpoint is not None:
-            run.save(Path(checkpoint))
+            run.save_last(Path(checkpoint), reason)
         return run.result(reason)
 
 
@@ -371,6 +372,15 @@ class _Run:
             state[f"progress.seconds_{name}"] = seconds
         checkpoints.save(path, checkpoints.Checkpoint(self.identity, state))
 
+    def save_last(self, path: Path, reason: str) -> None:
+        """Write the checkpoint at the end; where the run is done, its picture does not need it."""
+        try:
+            self.save(path)
+        except checkpoints.CheckpointError as error:  # a full disk
+            if reason == "interrupted":
+                raise
+            warnings.warn(f"{error}; the picture is not affected", stacklevel=3)
+
     def go_on(self, path: Path) -> None:
         """Continue from a checkpoint, or start anew if there is none yet: the image is the same."""
         if not path.exists():
@@ -433,14 +443,17 @@ class _Run:
             look()
         return pilot
 
-    def _settle(self, pilot: Pilot, report: Report) -> None:
-        """Adopt the pilot's plan and sampler, unless the run ends with its round."""
-        self.piloted = False
+    def _settle(self, pilot: Pilot, report: Report, look: Callable[[], None]) -> None:
+        """Adopt the pilot's plan and sampler, unless the run ends with its round.
+
+        Where ``look`` ends it, nothing is adopted, and the run is one without a plan.
+        """
         if report.stop_reason is not None:
             self.plan = self.plan.ended()
-            return
-        pilot.settle()
-        self.sampler, self.plan = pilot.sampler, pilot.plan
+        else:
+            pilot.settle(look)
+            self.sampler, self.plan = pilot.sampler, pilot.plan
+        self.piloted = False
 
     def until_done(
         self, watch: Watch, time_limit: float, checkpoint: str | os.PathLike[str] | None
@@ -449,10 +462,14 @@ class _Run:
         saved = time.monotonic()
         clock = _Clock(self.renderer, self.seconds)
 
-        def look() -> None:
-            """End the run at once where nothing more is to be done."""
+        def listen() -> None:
+            """End the run at once where the user wants it."""
             if watch.presses() > 1:
                 raise _EndedError("interrupted")
+
+        def look() -> None:
+            """End the run at once where nothing more is to be done."""
+            listen()
             # The first round is always completed: without it there is no image, and no prediction.
             late = time.monotonic() - self.begun > time_limit
             if late and self.sampler.report() is not None:
@@ -476,7 +493,7 @@ class _Run:
             while True:
                 for report in rounds(self.sampler, clock, clock.at_once, look=look, told=told):
                     if pilot is not None and self.piloted:
-                        self._settle(pilot, report)
+                        self._settle(pilot, report, listen)
                         if report.stop_reason is None:
                             break  # continue with another sampler where something is left out
                     watch.round(self.report())
@@ -521,6 +538,7 @@ class _Run:
             "nonfinite": report.nonfinite if report is not None else 0,
             "pixels_empty": empty,
             "black": not sampler.image.any(),
+            "grey": sampler.grey,
             "unbiased": identity["unbiased"],
             "width": width,
             "height": height,

@@ -26,7 +26,7 @@ StopReason = Literal["tolerance", "noise_threshold", "max_spp"]
 StrategyName = Literal["perceptual", "objective", "uniform", "halfbuffer"]
 
 # Version of `state`, raised when an older state would be continued differently.
-STATE_VERSION = 8
+STATE_VERSION = 9
 
 # Share of the tolerance that a round aims at, since a prediction is not exact. Status: choice.
 AIM = 0.98
@@ -247,12 +247,23 @@ class Sampler:
         """Return the report of the last decision; None before the pilot is complete."""
         return self._report
 
-    def largest_without(self, part: Statistics) -> float:
+    def largest_without(self, part: Statistics, look: Callable[[], None] = lambda: None) -> float:
         """Return the visible difference that leaving out a part of the light makes, JND.
 
-        ``part`` has what is left out of each sample so far; see `Model.largest_without`.
+        ``part`` has what is left out of each sample so far; see `Model.largest_without`. ``look``
+        is as in `ask`.
         """
-        return Model(self.metric, self._statistics, self.size).largest_without(part)
+        grey = self.grey and part.grey()
+        model = Model(self.metric, self._statistics, self.size, look, grey)
+        return model.largest_without(part)
+
+    @property
+    def grey(self) -> bool:
+        """Whether all samples so far are grey, so that one plane is decided on in place of three.
+
+        It changes decisions by rounding only.
+        """
+        return self._statistics.grey()
 
     @property
     def image(self) -> Plane:
@@ -267,9 +278,14 @@ class Sampler:
     @property
     def variance(self) -> Plane:
         """(H, W, 3), the estimated variance of ``image``."""
-        single = pooled_covariance(self._statistics, self.size)[FIRST == SECOND]
-        variance: Plane = np.moveaxis(single, 0, -1) / np.maximum(self.count, 1)[..., None]
+        variance: Plane = self.single_variance / np.maximum(self.count, 1)[..., None]
         return variance
+
+    @property
+    def single_variance(self) -> Plane:
+        """(H, W, 3), the estimated variance of a single sample."""
+        single = pooled_covariance(self._statistics, self.size)[FIRST == SECOND]
+        return np.moveaxis(single, 0, -1)
 
     def state(self) -> dict[str, Any]:
         """Return all that a continuation needs: a flat dict of arrays, numbers, strings and None.

@@ -129,6 +129,16 @@ class Statistics:
         self.drawn += other.drawn
         self.nonfinite += other.nonfinite
 
+    def grey(self) -> bool:
+        """Return whether all samples are grey: R, G and B equal in each.
+
+        Means and co-moments are then equal bit for bit, because all three channels take the same
+        steps; and one coloured sample tells them apart.
+        """
+        return all(
+            bool((plane == of[0]).all()) for of in (self.mean, self.comoments) for plane in of[1:]
+        )
+
     def covariance(self) -> Plane:
         """Return the unbiased covariance of single samples, (6, P); 0 below two samples."""
         return self.comoments / np.maximum(self.count - 1, 1)

@@ -103,7 +103,7 @@ class _Level:
         self.parents = functional.pad(parents, (left, right, top, down), mode="replicate")
 
     def padded(self, plane: Tensor) -> Tensor:
-        """Return a plane (1, 3, n, h, w) with its border replicated to cover all pieces."""
+        """Return a plane (1, C, n, h, w) with its border replicated to cover all pieces."""
         return functional.pad(plane, (*self._sides, 0, 0), mode="replicate")
 
 
@@ -118,9 +118,15 @@ class LocalErrors:
     metric
         The metric that judges.
     truth
-        The image, with the details that it is taken to have; (1, 3, ...).
+        The image, with the details that it is taken to have; (1, C, ...), with one plane of a grey
+        image for three.
     leaves
-        (1, 3, H, W), float32: the variances of the pixels with which others are compared.
+        (1, C, H, W), float32: the variances of the pixels with which others are compared.
+
+    Attributes
+    ----------
+    own
+        What `at` returns for ``leaves``.
     """
 
     def __init__(self, metric: VDM, truth: Cortex, leaves: Tensor) -> None:
@@ -146,14 +152,22 @@ class LocalErrors:
             )
             for number in range(few, len(nodes))
         ]
-        self._variances = detail_variances(leaves, metric.observer.true_means)[few:]
+        variances = detail_variances(leaves, metric.observer.true_means)
+        self._variances = variances[few:]
         self._kept = [
             self._computed(level, variance)
             for level, variance in zip(self._levels, self._variances, strict=True)
         ]
+        self.own: tuple[Tensor, ...] = (
+            *local_errors(metric, self._coarse, variances[:few], leaves),
+            *(
+                kept[..., level.before[0] :, level.before[1] :]
+                for level, kept in zip(self._levels, self._kept, strict=True)
+            ),
+        )
 
     def at(self, leaves: Tensor, pays: float = PAYS) -> tuple[Tensor, ...]:
-        """Return the local errors, as `local_errors`, for these variances of pixels, (1, 3, H, W).
+        """Return the local errors, as `local_errors`, for these variances of pixels, (1, C, H, W).
 
         Untouched tiles are skipped where touched ones are at most the share ``pays`` of a level,
         which changes no bit.
@@ -198,7 +212,7 @@ class LocalErrors:
         else:
             local, cut = kept.clone(), level.tiles
         whole = level.padded(variance)
-        nothing = variance.new_zeros(1, 3, 1, 1)
+        nothing = variance.new_zeros(1, variance.shape[1], 1, 1)
         together = max(AT_ONCE // (9 * cut.nodes), 1)
         for first in range(0, len(tiles), together):
             places = tiles[first : first + together]
@@ -239,7 +253,7 @@ def local_errors(
     variances
         Variances of its details.
     leaves
-        (1, 3, H, W), variances of its pixels.
+        (1, C, H, W), variances of its pixels.
 
     Returns
     -------
@@ -257,7 +271,7 @@ def local_errors(
 
 
 def _touched(variance: Tensor, before: Tensor, level: _Level) -> list[Place]:
-    """Return the tiles in which a variance (1, 3, n, h, w), or a neighbour's, differs."""
+    """Return the tiles in which a variance (1, C, n, h, w), or a neighbour's, differs."""
     differs = (variance != before).flatten(1, 2).any(1, keepdim=True).to(torch.float32)
     (height, width), (top, left), tiles = level.size, level.before, level.tiles
     sides = (left + 1, tiles.across * TILE - width + 1, top + 1, tiles.down * TILE - height + 1)

@@ -200,7 +200,9 @@ def _ratio(over: Plane, under: Plane, otherwise: float) -> Plane:
 def _four(plane: Plane) -> Plane:
     """Return the sums of 2x2 nodes; on an odd side the last sums are of fewer."""
     height, width = plane.shape[1:]
-    even = np.pad(plane, ((0, 0), (0, height % 2), (0, width % 2)))
+    even = plane
+    if height % 2 or width % 2:
+        even = np.pad(plane, ((0, 0), (0, height % 2), (0, width % 2)))
     rows = even[:, 0::2] + even[:, 1::2]
     total: Plane = rows[..., 0::2] + rows[..., 1::2]
     return total

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sampling.boundary import QUARTILE, boundaries, detail_variances
+from sampling.boundary import QUARTILE, _quarter, boundaries, detail_variances
 from torch_vdm import Haar
 from torch_vdm.model.cortex import Cortex
 
@@ -94,3 +94,13 @@ def test_without_variance_the_boundaries_are_the_image(signed: bool) -> None:
     for boundary in boundaries(cortex, nothing, 0.0 * mean_variance, QUARTILE, signed):
         for one, other in zip(boundary.details, cortex.details, strict=True):
             torch.testing.assert_close(one, other, rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("size", [(2, 2), (64, 32), (10, 514)], ids=str)
+def test_quarters_are_pytorchs_bit_for_bit(size: tuple[int, int]) -> None:
+    generator = torch.Generator().manual_seed(3)
+    nodes = torch.rand(1, 3, *size, generator=generator) ** 9
+    expected = torch.nn.functional.avg_pool2d(nodes, 2) * 0.25
+    assert torch.equal(_quarter(nodes), expected)
+    leaf = nodes.clone().requires_grad_(True)
+    assert torch.equal(_quarter(leaf).detach(), expected)

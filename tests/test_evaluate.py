@@ -19,6 +19,7 @@ import torch
 from torch_vdm import read_image, write_image
 from torch_vdm.cli import main
 from torch_vdm.evaluate import journal, judge
+from torch_vdm.io import atomic_path
 
 FRAMES = 8
 D3 = Path(str(files("torch_vdm.evaluate") / "web" / "d3.min.js"))
@@ -59,6 +60,25 @@ def one_line(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     assert told.err.count("\n") == 1, told.err
     assert "Traceback" not in told.err
     return told.err
+
+
+def test_what_a_killed_worker_left_half_written_is_removed(folders: Path) -> None:
+    assert main(arguments(folders)) == 0
+    out = folders / "out"
+    kept = [out / "maps/A/.hidden.exr", out / "pictures/.0123456789abcde.js", folders / "ref/.n"]
+    left = []
+    for target in (out / "maps/A/000.exr", out / "maps/B/007.png", out / "pictures/unknown.js"):
+        with atomic_path(target) as temporary:
+            temporary.touch()
+            left.append(temporary.with_name(temporary.name))
+    before = {path for path in out.rglob("*") if path.name not in ("unknown.js",)}
+    (out / "pictures/unknown.js").unlink()
+    for path in (*left, *kept):
+        path.write_bytes(b"half")
+    assert main(arguments(folders, "--resume")) == 0
+    assert not any(path.exists() for path in left)
+    assert all(path.read_bytes() == b"half" for path in kept)
+    assert before <= set(out.rglob("*"))
 
 
 def test_everything_is_written_and_said(folders: Path, capsys: pytest.CaptureFixture[str]) -> None:

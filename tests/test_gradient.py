@@ -72,6 +72,27 @@ def test_is_autograds_for_every_option(metric: VDM, monkeypatch: pytest.MonkeyPa
         torch.testing.assert_close(mine, theirs, rtol=1e-9, atol=1e-9 * float(mine.abs().max()))
 
 
+def test_is_autograds_for_one_plane_of_grey(monkeypatch: pytest.MonkeyPatch) -> None:
+    metric = VDM(60.0, Display.linear(100.0))
+    images = [image[:1, :1].expand(-1, 3, -1, -1) for image in noise((33, 20))]
+
+    def slopes(grey: bool) -> list[Tensor]:
+        leaves = [image[:, :1].clone().requires_grad_(True) for image in images]
+        first, second = (metric.represent(leaf.expand(-1, 3, -1, -1), grey=grey) for leaf in leaves)
+        power = metric.compare(first, second)
+        (power * torch.linspace(0.5, 2.0, power.numel()).view_as(power)).sum().backward()
+        return [leaf.grad for leaf in leaves if leaf.grad is not None]
+
+    ours, of_three = slopes(True), slopes(False)
+    monkeypatch.setattr(whole, "by_hand", lambda: False)
+    theirs = slopes(True)
+    assert len(ours) == len(theirs) == len(of_three) == 2
+    for mine, other, three in zip(ours, theirs, of_three, strict=True):
+        scale = float(three.abs().max())
+        torch.testing.assert_close(mine, other, rtol=1e-10, atol=1e-14 * scale)
+        torch.testing.assert_close(mine, three, rtol=1e-9, atol=1e-11 * scale)
+
+
 def test_is_of_use_on_the_default_route() -> None:
     # Else the others would compare autograd with itself.
     test, reference = noise((33, 20))

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 import OpenEXR
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from benchmarks.places import ROOT
-from sampling import Samples, rendering
+from sampling import Samples, cli, rendering
 from sampling.cli import main
 from sampling.renderers.llvm import find_llvm
 from sampling.renderers.mitsuba import MitsubaRenderer
@@ -156,6 +157,19 @@ def test_reproduce_reproduces(whole: tuple[list[str], Path], tmp_path: Path) -> 
     words[words.index("--output") + 1] = str(tmp_path / "again.exr")
     assert (program, main(words)) == ("vdm-render", 0)
     same_image(tmp_path / "again.exr", output)
+
+
+def test_reproduce_names_the_threads_where_bits_depend_on_them(
+    whole: tuple[list[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments, _ = whole
+    monkeypatch.setattr(rendering, "FEW_PIXELS", 1)
+    monkeypatch.setattr(cli, "FEW_PIXELS", 1)
+    words = ["--output", str(tmp_path / "a.exr"), "--json", str(tmp_path / "a.json")]
+    assert main([*arguments, *words]) == 0
+    told = figures(tmp_path / "a.json")
+    assert told["reproduce"].startswith(f"OMP_NUM_THREADS={torch.get_num_threads()} vdm-render ")
+    assert told["threads"] == torch.get_num_threads()
 
 
 @pytest.mark.parametrize("presses", [1, 2])

@@ -14,7 +14,8 @@ from typing import Any
 
 import pytest
 
-from sampling import cluster
+from sampling import checkpoint, cluster
+from sampling.checkpoint import Checkpoint, CheckpointError
 from sampling.cli import main
 from sampling.renderers.mitsuba import MitsubaRenderer
 from tests.conftest import one_line_error
@@ -203,6 +204,37 @@ def test_a_checkpoint_is_gone_on_from_where_it_is_of_this_run(
     monkeypatch.setattr(MitsubaRenderer, "sample", drawn)
     assert main([*words, "--resume"]) == 0
     assert not kept.exists()
+    same_image(out / "lamp.exr", tmp_path / "alone.exr")
+
+
+def test_a_full_disk_at_the_last_checkpoint_costs_no_picture(
+    scene: Path,
+    tmp_path: Path,
+    threads: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    kept = out / "lamp.checkpoint"
+    # A worker has begun it, and its checkpoint is gone on from.
+    alone = [str(scene), "--output", str(tmp_path / "alone.exr"), "--checkpoint", str(kept)]
+    assert main([*alone, *OPTIONS]) == 0
+    times = []
+
+    def full(path: Path, _: Checkpoint) -> None:
+        times.append(path)
+        raise CheckpointError(f"{path}: cannot be written: No space left on device")
+
+    monkeypatch.setattr(checkpoint, "save", full)
+    words = [str(scene), *OPTIONS, "--output", str(out), "--scheduler", threads]
+    capsys.readouterr()
+    assert main(words) == 0
+    told = capsys.readouterr()
+    assert len(times) == 1
+    assert "warning" in told.err
+    assert "No space left on device; the picture is not affected" in told.err
+    assert "1 rendered, 0 done before, 0 failed" in told.out
     same_image(out / "lamp.exr", tmp_path / "alone.exr")
 
 

@@ -1,5 +1,6 @@
 """What of a scene is left out: nothing that shows, and with what is kept the same bits."""
 
+import importlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,8 @@ from benchmarks.curves import difference
 from sampling import Sampler, Samples, Settings, Watch
 from sampling import plan as plans
 from sampling.checkpoint import CheckpointError
+from sampling.renderers import bounces
+from sampling.renderers.bounces import BOTH, LIGHTS, MATERIALS
 from sampling.renderers.mitsuba import MitsubaRenderer
 from sampling.statistics import Statistics
 from torch_vdm import VDM, Display
@@ -233,7 +236,10 @@ def test_a_cut_is_the_picture_of_a_scene_that_asks_for_less(mitsuba: Any, tmp_pa
     depth, bound = plan["max_depth"], plan["left_out_jnd"]
     assert 2 <= depth < 32
     assert 0.0 < bound <= QUARTER
-    short = rendered(room(mitsuba, 0.05, 0.05, 0.05, depth=depth), "full", 1.0 - bound, aov=True)
+    # The only light of a dim room is that of the lamp, at which rays are aimed.
+    assert plan["light_found_by"] == LIGHTS
+    by_lights = alone(mitsuba, depth, 64, LIGHTS)
+    short = rendered(of, "full", 1.0 - bound, aov=True, integrator=by_lights)
     np.testing.assert_array_equal(auto.image, short.image)
     np.testing.assert_array_equal(auto.samples, short.samples)
     np.testing.assert_allclose(auto.jnd, short.jnd + bound, rtol=1e-12)
@@ -245,11 +251,18 @@ def test_a_cut_is_the_picture_of_a_scene_that_asks_for_less(mitsuba: Any, tmp_pa
     assert auto.figures["predicted_max_jnd"] <= 1.0
     assert auto.converged
     assert f"paths of more than {depth} segments" in plan["why"]
+    assert "rays aimed at lights alone give the same picture" in plan["why"]
     json.dumps(auto.figures)
     auto.save(tmp_path / "out.exr")
     with OpenEXR.File(str(tmp_path / "out.exr")) as file:
         assert file.header()["plan"] == plan["why"]
     assert shown(of, depth) <= bound
+
+
+def alone(mi: Any, depth: int, roulette: int, found_by: str) -> Any:
+    """Return the integrator that finds light in one way alone."""
+    # Not at the top, where Dr.Jit would choose its LLVM.
+    return bounces.alone(mi, importlib.import_module("drjit"), depth, roulette, found_by)
 
 
 def shown(of: Scene, depth: int) -> float:
@@ -282,7 +295,7 @@ def test_what_is_seldom_seen_is_kept_bit_for_bit(mitsuba: Any, adversary: Any) -
 
 
 def test_a_pilot_that_keeps_everything_leaves_no_trace(mitsuba: Any) -> None:
-    of = room(mitsuba, 0.5, 0.5, 0.5, depth=5)
+    of = room(mitsuba, 0.5, 0.5, 0.5, roulette=3)
     auto, full = rendered(of, "auto", 2.0, aov=True), rendered(of, "full", 2.0, aov=True)
     assert "the mean of the picture alone" in auto.figures["plan"]["why"]
     assert auto.figures["samples_total"] == full.figures["samples_total"]
@@ -290,6 +303,84 @@ def test_a_pilot_that_keeps_everything_leaves_no_trace(mitsuba: Any) -> None:
     np.testing.assert_array_equal(auto.jnd, full.jnd)
     for name, plane in full.aovs.items():
         np.testing.assert_array_equal(auto.aovs[name], plane)
+
+
+def even(mi: Any, depth: int = 4, **lights: Any) -> Scene:
+    """Return a ball on the ground, under an even sky unless there are other lights."""
+    of = plain(mi, **lights)
+    of["integrator"] = {"type": "path", "max_depth": depth}
+    if lights:
+        del of["sky"]
+    return of
+
+
+def test_under_an_even_sky_light_is_found_by_materials(mitsuba: Any) -> None:
+    of = even(mitsuba)
+    auto, full = rendered(of, "auto", aov=True), rendered(of, "full")
+    plan = auto.figures["plan"]
+    assert plan["light_found_by"] == MATERIALS
+    assert "rays that materials scatter alone give the same picture" in plan["why"]
+    assert auto.converged
+    # Fewer samples, each of fewer rays.
+    assert auto.figures["samples_total"] < 0.7 * full.figures["samples_total"]
+    by_materials = alone(mitsuba, 4, 5, MATERIALS)
+    same = rendered(of, "full", aov=True, integrator=by_materials)
+    np.testing.assert_array_equal(auto.image, same.image)
+    np.testing.assert_array_equal(auto.samples, same.samples)
+    for name, plane in same.aovs.items():
+        np.testing.assert_array_equal(auto.aovs[name], plane)
+    # The promise.
+    many = drawn(of, 4096).mean(1).reshape(SIDE, SIDE, 3)
+    assert difference(VDM(60.0, Display.linear(100.0)), auto.image, many).max() <= 1.0
+
+
+def sun(mi: Any) -> Scene:
+    """Return an environment that is dim and even but for one pixel, which lights the scene."""
+    sky = np.full((64, 128, 3), 0.1, np.float32)
+    sky[12, 40] = 2e3
+    return {"type": "envmap", "bitmap": mi.Bitmap(sky)}
+
+
+@pytest.mark.parametrize("what", ["tiny lamp", "lamp in the sky", "point", "sun"])
+def test_light_that_materials_seldom_meet_is_aimed_at(mitsuba: Any, what: str) -> None:
+    lights: dict[str, Scene] = {
+        "tiny lamp": {"lamp": lamp([1, 3, 1], 0.01, 3e4)},
+        "lamp in the sky": {"dome": {"type": "constant"}, "lamp": lamp([1, 1, 1], 0.003, 2e4)},
+        "point": {
+            "dome": {"type": "constant"},
+            "lamp": {"type": "point", "position": [1, 1, 1], "intensity": 0.3},
+        },
+        "sun": {"sun": sun(mitsuba)},
+    }
+    # No ray is the last one, whose light another has found.
+    of = even(mitsuba, 32, **lights[what])
+    auto, full = rendered(of, "auto", 0.7), rendered(of, "full", 0.7)
+    plan = auto.figures["plan"]
+    assert auto.figures["rounds"] > 1
+    if what == "sun":  # rays aimed by the sky's brightness do alone, or nearly
+        assert plan["light_found_by"] in (BOTH, LIGHTS)
+        return
+    assert plan["light_found_by"] == BOTH
+    assert "neither alone would find light with less work" in plan["why"]
+    np.testing.assert_array_equal(auto.image, full.image)
+
+
+@pytest.mark.parametrize("what", ["lamp in the sky", "sun"])
+def test_a_pilot_that_never_met_the_lamp_is_not_believed(
+    mitsuba: Any, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    # Even if the first glance took materials alone for cheap.
+    lights: dict[str, Scene] = {
+        "lamp in the sky": {"dome": {"type": "constant"}, "lamp": lamp([1, 1, 1], 0.003, 2e4)},
+        "sun": {"sun": sun(mitsuba)},
+    }
+    of = even(mitsuba, 4, **lights[what])
+    monkeypatch.setattr(plans, "_glanced_noise", lambda _, way: 0.1 if way == MATERIALS else 1.0)
+    plan = rendered(of, "auto", 0.7).figures["plan"]
+    assert plan["evidence"]["light_considered"] == MATERIALS
+    assert plan["evidence"]["times_the_samples"] > 2.0
+    assert plan["light_found_by"] == BOTH
+    assert "rays that materials scatter alone would need" in plan["why"]
 
 
 class EndsAfter(Watch):
@@ -353,6 +444,43 @@ def test_interrupted_anywhere_the_same_bits(
     resumed = sampling.render(path, **OPTIONS, resume=kept)
     np.testing.assert_array_equal(resumed.image, whole.image)
     assert resumed.figures["plan"] == whole.figures["plan"]
+
+
+class EndsTheJudging(Watch):
+    """Ends a run at once, while its pilot is judged."""
+
+    judging = False
+
+    def presses(self) -> int:
+        """Return 2 while it is."""
+        return 2 if self.judging else 0
+
+
+def test_interrupted_while_the_pilot_is_judged(
+    dim: tuple[Path, sampling.Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (path, whole), kept, watch = dim, tmp_path / "kept.npz", EndsTheJudging()
+    settle = plans.Pilot.settle
+
+    def judged(self: plans.Pilot, *look: Any) -> None:
+        watch.judging = True
+        settle(self, *look)
+
+    def waited(*_: Any) -> None:
+        raise AssertionError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(plans.Pilot, "settle", judged)
+        # The longest piece of its work is not begun.
+        patch.setattr(Sampler, "largest_without", waited)
+        ended = sampling.render(path, **OPTIONS, checkpoint=kept, watch=watch)
+    assert ended.stop_reason == "interrupted"
+    assert ended.report is not None
+    assert ended.figures["plan"]["left_out"] == []
+    # What the plan would have been is not known: the same bits need the pilot again.
+    with pytest.warns(UserWarning, match="within the first round, of which nothing is kept"):
+        resumed = sampling.render(path, **OPTIONS, resume=kept)
+    np.testing.assert_array_equal(resumed.image, whole.image)
 
 
 class EndsItsRound(Watch):

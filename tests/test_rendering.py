@@ -337,6 +337,19 @@ def test_depth_needs_no_light(mitsuba: Any) -> None:
     assert not result.figures["black"]
 
 
+def test_a_grey_picture_is_told(
+    two: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(two), "--output", str(tmp_path / "out.exr"), "--max-spp", "4"]
+    assert main(words) == 0
+    assert "grey: all samples are" in capsys.readouterr().out
+    two.write_text(
+        TWO.replace('"constant"/>', '"constant"><rgb name="radiance" value="1,1,2"/></emitter>')
+    )
+    assert main(words) == 0
+    assert "grey:" not in capsys.readouterr().out
+
+
 def test_a_black_picture_is_told(
     two: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -72,6 +72,18 @@ def test_skipping_changes_no_bit(observer: Observer, size: tuple[int, int]) -> N
             assert all(torch.equal(one, other) for one, other in zip(found, every, strict=True))
 
 
+@pytest.mark.usefixtures("_threads")
+@each_size
+@each_observer
+def test_the_errors_so_far_are_those_of_its_own_variances(
+    observer: Observer, size: tuple[int, int]
+) -> None:
+    model = modelled(size, observer)
+    for pays in (SKIP_ALWAYS, COMPUTE_ALL):
+        found = model.errors.at(model.leaves(), pays)
+        assert all(torch.equal(one, own) for one, own in zip(found, model.errors.own, strict=True))
+
+
 @each_size
 @each_observer
 def test_pieces_are_the_metric_in_one_piece(observer: Observer, size: tuple[int, int]) -> None:

@@ -268,14 +268,24 @@ class VDM(PairMetric):
         largest: Tensor = self(test, reference).amax((1, 2, 3))
         return largest
 
-    def represent(self, image: Tensor) -> Cortex:
+    def represent(self, image: Tensor, grey: bool = False) -> Cortex:
         """Return the cortex representation of an image: display, cones, transform.
 
-        ``image`` is (B, 3, H, W), as the display expects it; half precision becomes float32.
+        ``image`` is (B, 3, H, W), as the display expects it; half precision becomes float32. With
+        ``grey`` its channels must be equal: one plane, of linear values, then stands for the three
+        cones, with a transform that is `Haar()` or another without a filter before it. What is
+        computed from it changes by rounding only, and takes less time.
         """
         self._require_image("an image", image)
+        if grey and self.transform.csf != "levels":
+            raise ValueError(f"expected grey with csf 'levels', got {self.transform.csf!r}")
         image = image.to(torch.promote_types(image.dtype, torch.float32)).contiguous()
-        return self.model(image.dtype).represent(image)
+        return self.model(image.dtype, grey=grey).represent(image)
+
+    def _model_of(self, cortex: Cortex, steps: Steps | None = None) -> Model:
+        """Return the model for a representation, of three cones or of the one plane of a grey."""
+        grey = self.transform.csf == "levels" and cortex.mean.shape[1] == 1
+        return self.model(cortex.mean.dtype, steps, grey)
 
     def respond(self, cortex: Cortex) -> tuple[Tensor, ...]:
         """Return the responses of one image, from chromatic aberration to the transducer.
@@ -283,7 +293,7 @@ class VDM(PairMetric):
         There is one (B, channels, orientations, h, w) per level, level 0 first; 1 is threshold.
         Those of a signed observer are weighted contrasts: their masking involves the other image.
         """
-        return self.model(cortex.mean.dtype).responses(cortex)
+        return self._model_of(cortex).responses(cortex)
 
     def lowpass_difference(self, first: Cortex, second: Cortex) -> Tensor:
         """Return the weighted contrast between the means of two images, the lowpass term.
@@ -291,7 +301,7 @@ class VDM(PairMetric):
         It is (B, channels, 1, 1), not negative, 1 at threshold; and 0 for an observer that never
         compares them. A uniform change is seen here and nowhere else.
         """
-        return self.model(first.mean.dtype).lowpass_difference(first, second)
+        return self._model_of(first).lowpass_difference(first, second)
 
     def local_differences(self, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
         """Return the local visual difference of every node (Eq. 5), before the root is taken.
@@ -299,7 +309,7 @@ class VDM(PairMetric):
         There is one (B, 1, h, w) per level, level 0 first.
         """
         schedule = self._schedule
-        model = self.model(first.mean.dtype, schedule)
+        model = self._model_of(first, schedule)
         return whole.local_differences(model, schedule, first, second)
 
     def compare(self, first: Cortex, second: Cortex) -> Tensor:
@@ -309,7 +319,7 @@ class VDM(PairMetric):
         a time, which bounds memory.
         """
         schedule = self._schedule
-        return whole.compared(self.model(first.mean.dtype, schedule), schedule, first, second)
+        return whole.compared(self._model_of(first, schedule), schedule, first, second)
 
     def beside(self, first: Cortex) -> Callable[[Cortex], Tensor]:
         """Return `compare` with a fixed first representation, whose responses are computed once.
@@ -320,12 +330,12 @@ class VDM(PairMetric):
         charged to all pixels below them, which makes no difference to the largest value of the map
         for noise that is everywhere.
         """
-        model = self.model(first.mean.dtype)
+        model = self._model_of(first)
         sights = model.adaptation(first)
         responses = model.responses(first, sights)
 
         def compare(second: Cortex) -> Tensor:
-            model = self.model(second.mean.dtype)
+            model = self._model_of(second)
             options = model.options()
             same = first.windows is not None and second.windows is first.windows
             others = model.responses(second, sights if same else None)

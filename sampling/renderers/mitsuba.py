@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sampling.renderers import bounces, hemisphere
+from sampling.renderers.bounces import BOTH, LIGHTS, MATERIALS
 from sampling.renderers.filter import FILTERS, SCENE, PixelFilter
 from sampling.renderers.llvm import OLDEST, PACKAGE, VARIABLE, find_llvm
 from sampling.renderers.needs import PATH, Needs
@@ -57,13 +58,20 @@ class SceneError(ValueError):
 
 
 class Bounced(NamedTuple):
-    """Samples, and what they would be if no path were longer than so many segments."""
+    """Samples, and what they would be with shorter paths, and with light found in another way."""
 
     samples: Samples
     within: NDArray[np.float32]
-    """(N, 3)."""
-    segments: NDArray[np.float32]
-    """(N,), how many path segments were traced."""
+    """(N, 3), with paths of no more than so many segments."""
+    alone: NDArray[np.float32]
+    """(N, 3), the same with light found by ``found_by``."""
+    excess: dict[str, NDArray[np.float32]]
+    """(N,), by `LIGHTS` and `MATERIALS`: estimates of how much larger the second moment of
+    ``alone`` is than that of ``within``, summed over R, G, B."""
+    rays: NDArray[np.float32]
+    """(N,), how many rays were traced, those aimed at lights included."""
+    rays_within: dict[str, NDArray[np.float32]]
+    """(N,), the same with the shorter paths, by `BOTH`, `LIGHTS` and `MATERIALS`."""
 
 
 class MitsubaRenderer:
@@ -207,18 +215,20 @@ class MitsubaRenderer:
         pixels: NDArray[np.int64],
         first: NDArray[np.int64],
         count: NDArray[np.int64],
-        cut: int,
+        cut: int | None,
+        found_by: str = BOTH,
     ) -> Bounced:
         """Draw the same samples, and what each is with at most ``cut`` path segments.
 
         It takes the integrators of `Needs`, without media and in compiled RGB variants only. The
         samples are those of ``path``, bit for bit, and the shorter ones those of ``path`` of that
-        depth.
+        depth; those by ``found_by`` are what is drawn after `simulate` with the same. See
+        `bounces.make`.
         """
         before = self._integrator, self._aov_at
         needs, dr = self.needs, importlib.import_module("drjit")
         self._mi.set_variant(self.variant)
-        told = bounces.make(self._mi, dr, needs.max_depth, needs.rr_depth, cut)
+        told = bounces.make(self._mi, dr, needs.max_depth, needs.rr_depth, cut, found_by)
         self._aov_at = len(told.aov_names())
         self._with_aovs(told)
         self._told = slice(self._aov_at - len(told.aov_names()), self._aov_at)
@@ -227,16 +237,33 @@ class MitsubaRenderer:
         finally:
             self._integrator, self._aov_at = before
             self._told = slice(0)
-        segments = (beside[-1] / self.pixel_filter.rays).astype(np.float32)
-        return Bounced(samples, np.stack(beside[:-1], -1), segments)
+        *light, of_lights, of_materials, rays, both, lights, materials = beside
+        return Bounced(
+            samples,
+            np.stack(light[:3], -1),
+            np.stack(light[3:], -1),
+            {LIGHTS: of_lights, MATERIALS: of_materials},
+            rays,
+            {BOTH: both, LIGHTS: lights, MATERIALS: materials},
+        )
 
-    def simulate(self, max_depth: int | None) -> None:
-        """Render with ``path`` of that depth instead of the scene's own integrator."""
-        self._mi.set_variant(self.variant)
+    def simulate(self, max_depth: int | None, found_by: str = BOTH) -> None:
+        """Render with ``path`` of that depth instead of the scene's own integrator.
+
+        With `LIGHTS` or `MATERIALS` it finds light by these alone.
+        """
+        mi, needs = self._mi, self.needs
+        mi.set_variant(self.variant)
         depth = -1 if max_depth is None else max_depth
-        words = {"type": PATH, "max_depth": depth, "rr_depth": self.needs.rr_depth}
+        words = {"type": PATH, "max_depth": depth, "rr_depth": needs.rr_depth}
         self._aov_at = 0
-        self._with_aovs(self._mi.load_dict(words))
+        self._with_aovs(
+            mi.load_dict(words)
+            if found_by == BOTH
+            else bounces.alone(
+                mi, importlib.import_module("drjit"), max_depth, needs.rr_depth, found_by
+            )
+        )
         self._named = PATH, max_depth
 
     def _with_aovs(self, integrator: Any) -> None:
@@ -348,10 +375,14 @@ class MitsubaRenderer:
         planes = [mi.Float(dr.select(valid, 1.0, 0.0))] if self._alpha else []
         planes += aovs[self._aov_at :]
         planes = [plane * place.weight for plane in planes]
+        lights, moments = len(bounces.LIGHT_AOVS), len(bounces.MOMENT_AOVS)
         for i, plane in enumerate(aovs[self._told]):
-            # All are light but the last, which is a count.
-            light_too = i < len(aovs[self._told]) - 1
-            planes.append(weight[i % 3] * plane * place.weight if light_too else plane)
+            if i < lights:
+                planes.append(weight[i % 3] * plane * place.weight)
+            elif i < lights + moments:
+                planes.append(dr.square(dr.max(weight) * place.weight) * plane)
+            else:
+                planes.append(plane)
         return light * place.weight, planes
 
     def _load_file(self, path: Path, variant: str) -> None:

@@ -41,6 +41,8 @@ class Needs(NamedTuple):
     """Whether any surface scatters light."""
     broad_lights: bool
     """Whether any light can be hit by chance: it has an area, or is the environment."""
+    sharp_lights: bool
+    """Whether any light is a point or has one direction, and cannot be hit by chance."""
     unread: bool
     """Whether there are instances, whose materials cannot be read."""
     tellable: bool
@@ -61,6 +63,7 @@ def read(mi: Any, scene: Any, sensor: Any, integrator: Any) -> Needs:
     every = [shape.bsdf() for shape in shapes if shape.bsdf() is not None]
     bsdfs = list({bsdf.ptr: bsdf for bsdf in every}.values())
     flags = [int(bsdf.flags()) for bsdf in bsdfs]
+    lights = [int(light.flags()) for light in scene.emitters()]
     null, delta = int(mi.BSDFFlags.Null), int(mi.BSDFFlags.Delta)
     return Needs(
         integrator=name,
@@ -80,9 +83,9 @@ def read(mi: Any, scene: Any, sensor: Any, integrator: Any) -> Needs:
         ),
         scatters=any(not _black(mi, bsdf) for bsdf in bsdfs),
         broad_lights=any(
-            int(light.flags()) & int(mi.EmitterFlags.Surface | mi.EmitterFlags.Infinite)
-            for light in scene.emitters()
+            light & int(mi.EmitterFlags.Surface | mi.EmitterFlags.Infinite) for light in lights
         ),
+        sharp_lights=any(light & int(mi.EmitterFlags.Delta) for light in lights),
         unread=any(shape.class_name() in ("Instance", "ShapeGroup") for shape in shapes),
         tellable=not mi.variant().startswith("scalar") and mi.variant().endswith("_rgb"),
     )

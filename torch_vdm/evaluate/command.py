@@ -25,10 +25,10 @@ from torch_vdm.evaluate.frames import (
     read_manifest,
 )
 from torch_vdm.evaluate.journal import Journal, Result, Selection
-from torch_vdm.evaluate.judge import Bench, Judge, settings
+from torch_vdm.evaluate.judge import PICTURES, Bench, Judge, map_paths, settings
 from torch_vdm.evaluate.overview import Overview
 from torch_vdm.evaluate.statistics import counted
-from torch_vdm.io import check_target
+from torch_vdm.io import check_target, remove_abandoned
 from torch_vdm.report import plain_console, progress
 
 RESULTS, TABLE, PARQUET, REPORT = "results.json", "table.csv", "table.parquet", "report.html"
@@ -130,6 +130,7 @@ def run(options: argparse.Namespace, bench: Bench, assumptions: Sequence[str]) -
     _prepare(options)
     with Journal(options.output) as lines:
         _work_through(options, bench, matched, lines)
+        _clear(options.output, matched)
         keys = _ordered(matched)
         results = Selection(lines, keys)
         frames = len({frame for frame, _ in keys})
@@ -238,6 +239,13 @@ def _work_through(
         except KeyboardInterrupt:
             print(f"what is done is kept in {options.output}; --resume goes on", file=sys.stderr)
             raise
+
+
+def _clear(output: Path, matched: Matched) -> None:
+    """Remove what workers that were killed left half-written."""
+    # Whole folders: the name of a picture that was never written is not known.
+    maps = {map_paths(output, job.frame, job.test)[0].parent for job in matched.jobs}
+    remove_abandoned((), [*maps, output / PICTURES])
 
 
 def _ordered(matched: Matched) -> list[tuple[str, str]]:

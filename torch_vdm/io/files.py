@@ -377,19 +377,20 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def remove_abandoned(paths: Iterable[Path]) -> None:
+def remove_abandoned(paths: Iterable[Path], folders: Iterable[Path] = ()) -> None:
     """Remove the temporary files of `atomic_path` that killed processes left next to some files.
 
-    Nobody may be writing these files.
+    In ``folders`` they are removed whatever file they were of. Nobody may be writing these files.
     """
     marks: dict[Path, set[tuple[str, str]]] = {}
     for path in paths:
         target = Path(os.path.realpath(path))
         marks.setdefault(target.parent, set()).add((_mark(target), target.suffix))
-    for folder, ours in marks.items():
+    whole = set(folders)
+    for folder in {*marks, *whole}:
         for path in folder.glob(".*"):
             found = _TEMPORARY.fullmatch(path.name)
-            if found and found.groups() in ours:
+            if found and (folder in whole or found.groups() in marks[folder]):
                 path.unlink(missing_ok=True)
 
 

@@ -137,6 +137,13 @@ class Sight(NamedTuple):
         return Sight(self.scale, self.sensitivity[:, :, orientations])
 
 
+def pushed(sights: Sequence[Sight], size: tuple[int, int], before: Before = NONE) -> list[Sight]:
+    """Return two images' channel weightings `Sight.pushed`; one that both share only once."""
+    one, other = sights
+    first = one.pushed(size, before)
+    return [first, first if other is one else other.pushed(size, before)]
+
+
 class Options(NamedTuple):
     """What the boxes of a level depend on besides details and channel weightings."""
 

@@ -34,6 +34,7 @@ from torch_vdm.model.level import (
     Options,
     Sight,
     local_difference,
+    pushed,
     response,
     sights_of,
 )
@@ -195,9 +196,8 @@ class Model:
     def local_difference(self, first: Cortex, second: Cortex, number: int, level: Level) -> Tensor:
         """Return the local visual difference (B, 1, h, w) of the level of this number."""
         details, others = first.details[number], second.details[number]
-        sight, other_sight = (
-            sight.pushed(_size(details), first.before[number])
-            for sight in self.sights(level, (first, second), number)
+        sight, other_sight = pushed(
+            self.sights(level, (first, second), number), _size(details), first.before[number]
         )
         images = details, others, sight, other_sight
         return local_difference(*images, self.options(), self.steps)
@@ -301,8 +301,11 @@ class Model:
         if self.transform.csf == "filter":
             return [weights_alone(level)] * len(images)
         parents = [cortex.parent_lowpass(number) for cortex in images]
-        sights: list[Sight] = self.steps(sights_of, parents, level, *self.sight_options())
-        return sights
+        # Images that are compared at the same light share it, and what follows from it.
+        one = all(parent is parents[0] for parent in parents)
+        some = parents[:1] if one else parents
+        sights: list[Sight] = self.steps(sights_of, some, level, *self.sight_options())
+        return sights * len(images) if one else sights
 
     def sight_options(self) -> tuple[dict[str, Tensor], bool, bool, Tensor | None]:
         """Return what `sights_of` takes besides parents and level."""

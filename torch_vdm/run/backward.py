@@ -79,7 +79,7 @@ class _LocalDifference(torch.autograd.Function):
         wanted: tuple[bool, ...] = ctx.needs_input_grad[4:]
         if torch.is_grad_enabled():
             # It will be differentiated again, so this is left to autograd.
-            images = tuple(image.view_as(image) for image in images)
+            images = tuple(image if image is None else image.view_as(image) for image in images)
             inputs = [image for image, want in zip(images, wanted, strict=True) if want]
             local = _apply(ctx.function, images)
             found = iter(torch.autograd.grad(local, inputs, gradient, create_graph=True))
@@ -134,6 +134,8 @@ class _Path(NamedTuple):
 def _weighted(image: Sequence[Tensor], matrix: Tensor) -> _Path:
     """Return the path of an image."""
     details, scale, sensitivity = image
+    if scale is None:  # one plane of a grey image: the sensitivity has the rest
+        return _Path(details, details, details * sensitivity)
     contrast = local_contrast(details, scale)
     opponent = opponents(contrast, matrix)
     return _Path(contrast, opponent, opponent * sensitivity)
@@ -156,6 +158,15 @@ def _by_image(
         return None, None, None
     details, scale, sensitivity = image
     by_weighted = path.weighted.mul_(by_square).add_(by_difference)
+    if scale is None:
+        of_grey = (by_weighted * factor for factor in (sensitivity, details))
+        by_details, by_sensitivity = (
+            product.sum_to_size(sized.shape) if want else None
+            for product, sized, want in zip(
+                of_grey, (details, sensitivity), wanted[::2], strict=True
+            )
+        )
+        return by_details, None, by_sensitivity
     by_sensitivity = None
     if wanted[2]:
         by_sensitivity = path.opponent.mul_(by_weighted).sum_to_size(sensitivity.shape)

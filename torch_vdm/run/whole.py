@@ -15,6 +15,7 @@ from torch_vdm.model.level import (
     Sight,
     local_difference,
     pooled_difference,
+    pushed,
     response_difference,
     response_difference_at,
     summed_across,
@@ -73,10 +74,8 @@ def level_difference(
     """Return `Model.local_difference` of a level."""
     details, others = first.details[number], second.details[number]
     options = model.options()
-    sight, other_sight = (
-        sight.pushed(_size(details), first.before[number])
-        for sight in model.sights(level, (first, second), number)
-    )
+    sights = model.sights(level, (first, second), number)
+    sight, other_sight = pushed(sights, _size(details), first.before[number])
     # One orientation at a time where the planes are large and no orientation masks another:
     # intermediate results then stay in the cache. Compiled code keeps none.
     at_once = orientations = details.shape[2]
@@ -95,7 +94,6 @@ def level_difference(
         and options.masking
         and options.pooled > 1
         and model.transform == Haar()
-        and model.grey is None
         and not schedule.compiled
         and not any(constant.requires_grad for constant in fixed)
     )
