@@ -175,7 +175,7 @@ def map_and_gradients(schedule: Schedule, images: tuple[Tensor, Tensor]) -> list
 
 
 def test_maps_and_losses() -> None:
-    test, reference = torch.rand(2, 1, 3, 11, 6, dtype=torch.float64)
+    test, reference = torch.rand(2, 1, 3, 5, 6, dtype=torch.float64)
     images = test, reference
     schedule = Schedule(kernel=True, together=True, cached=False, few=limits.EVERY_LEVEL)
     actual, expected = (map_and_gradients(each, images) for each in (schedule, PLAIN))
@@ -184,14 +184,14 @@ def test_maps_and_losses() -> None:
 
 
 def test_grey_images_too() -> None:
-    image, other = torch.rand(2, 1, 1, 12, 9, dtype=torch.float64).expand(-1, -1, 3, -1, -1)
+    image, other = torch.rand(2, 1, 1, 4, 3, dtype=torch.float64).expand(-1, -1, 3, -1, -1)
     assert not VDM(schedule=KERNEL).plan(image, other).grey
     torch.testing.assert_close(VDM(schedule=KERNEL)(image, other), VDM()(image, other))
 
 
 def test_strips_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "STRIP", 1024)
-    images = torch.rand(2, 1, 3, 66, 33, dtype=torch.float64).unbind()
+    monkeypatch.setattr(limits, "STRIP", 512)
+    images = torch.rand(2, 1, 3, 66, 17, dtype=torch.float64).unbind()
     strips = VDM(schedule=Schedule("strips", kernel=True))
     torch.testing.assert_close(strips(*images), VDM()(*images))
 

@@ -92,54 +92,63 @@ def numbers_of(levels: Iterable[Tensor], constants: Mapping[str, Tensor]) -> Ten
 
 
 @triton.jit
+def _loaded(numbers):
+    """Return the 35 numbers as a tuple."""
+    loaded = ()
+    for number in tl.static_range(TRANSDUCER_EXPONENT + 1):
+        loaded = loaded + (tl.load(numbers + number),)
+    return loaded
+
+
+@triton.jit
 def _luminance(parent, plane, at, numbers):
     """Return the luminance at parents before it is clamped; as `adapted_luminance`."""
-    mixed = tl.load(parent + at) * tl.load(numbers + LUMINANCE_OF_CONES)
+    mixed = tl.load(parent + at) * numbers[LUMINANCE_OF_CONES]
     for cone in tl.static_range(1, 3):
-        mixed += tl.load(parent + cone * plane + at) * tl.load(numbers + LUMINANCE_OF_CONES + cone)
+        mixed += tl.load(parent + cone * plane + at) * numbers[LUMINANCE_OF_CONES + cone]
     return mixed
 
 
 @triton.jit
 def _band(luminance, numbers):
     """Return how many octaves a level is above the peak of A, and the exponential's argument."""
-    relative = tl.log2(tl.load(numbers + FREQUENCY) / tl.load(numbers + PEAK_FREQUENCY))
-    faint = tl.log2(1.0 + tl.load(numbers + PEAK_LUMINANCE) / luminance)
-    octaves = relative + tl.load(numbers + PEAK_EXPONENT) * faint
-    offset = tl.maximum(tl.abs(octaves), SMALLEST_OFFSET) / tl.load(numbers + BAND_WIDTH)
+    relative = tl.log2(numbers[FREQUENCY] / numbers[PEAK_FREQUENCY])
+    faint = tl.log2(1.0 + numbers[PEAK_LUMINANCE] / luminance)
+    octaves = relative + numbers[PEAK_EXPONENT] * faint
+    offset = tl.maximum(tl.abs(octaves), SMALLEST_OFFSET) / numbers[BAND_WIDTH]
     return octaves, offset
 
 
 @triton.jit
 def _dimmed(luminance, numbers):
     """Return by how many octaves A, and C1 and C2, are dimmed."""
-    dark = tl.log2(1.0 + tl.load(numbers + DIM_LUMINANCE) / luminance)
-    glare = tl.log2(1.0 + luminance / tl.load(numbers + GLARE_LUMINANCE))
-    achromatic = tl.load(numbers + ACHROMATIC_DIMMING) * dark
-    achromatic += tl.load(numbers + GLARE_EXPONENT) * glare
-    return achromatic, tl.load(numbers + CHROMATIC_DIMMING) * dark
+    dark = tl.log2(1.0 + numbers[DIM_LUMINANCE] / luminance)
+    glare = tl.log2(1.0 + luminance / numbers[GLARE_LUMINANCE])
+    achromatic = numbers[ACHROMATIC_DIMMING] * dark
+    achromatic += numbers[GLARE_EXPONENT] * glare
+    return achromatic, numbers[CHROMATIC_DIMMING] * dark
 
 
 @triton.jit
 def _sight(parent, plane, at, numbers):
     """Return the channel weighting at parents, as `sights_of`: 3 scales, 3 sensitivities."""
     luminance = tl.maximum(_luminance(parent, plane, at, numbers), 0.0)
-    luminance += tl.load(numbers + DARK_LIGHT)
+    luminance += numbers[DARK_LIGHT]
     sight = ()
     for cone in tl.static_range(3):
         adapted = tl.maximum(tl.load(parent + cone * plane + at), 0.0)
-        adapted += tl.load(numbers + DARK_CONES + cone)
-        sight = sight + (tl.load(numbers + PASSED + cone) / adapted,)
+        adapted += numbers[DARK_CONES + cone]
+        sight = sight + (numbers[PASSED + cone] / adapted,)
     octaves, offset = _band(luminance, numbers)
     achromatic, chromatic = _dimmed(luminance, numbers)
     falling = tl.exp(-offset * tl.sqrt(offset))
-    floor = tl.load(numbers + BAND_FLOOR)
+    floor = numbers[BAND_FLOOR]
     shape = tl.where(octaves > 0.0, falling, floor + (1.0 - floor) * falling)
-    gain = tl.load(numbers + ACHROMATIC_GAIN) / tl.load(numbers + GAIN)
+    gain = numbers[ACHROMATIC_GAIN] / numbers[GAIN]
     sight = sight + (gain * shape * tl.exp2(-achromatic),)
     dim = tl.exp2(-chromatic)
     for channel in tl.static_range(2):
-        sight = sight + (tl.load(numbers + BRIGHT + channel) * dim,)
+        sight = sight + (numbers[BRIGHT + channel] * dim,)
     return sight
 
 
@@ -158,10 +167,10 @@ def _opponents(contrasts, numbers):
     """Return the nine opponent contrasts of cone contrasts."""
     opponents = ()
     for number in tl.static_range(9):
-        row = numbers + OPPONENTS + 3 * (number // 3)
-        mixed = contrasts[number % 3] * tl.load(row)
+        mixed = contrasts[number % 3] * numbers[OPPONENTS + 3 * (number // 3)]
         for cone in tl.static_range(1, 3):
-            mixed += contrasts[3 * cone + number % 3] * tl.load(row + cone)
+            factor = numbers[OPPONENTS + 3 * (number // 3) + cone]
+            mixed += contrasts[3 * cone + number % 3] * factor
         opponents = opponents + (mixed,)
     return opponents
 
@@ -235,7 +244,7 @@ def _pooled(images, numbers, node, plane, parents, sizes):
 def _unmasked(sums, channel: tl.constexpr, numbers):
     """Return the base that a channel's energies are divided by, and the factor of their ratio."""
     base = 1.0 + sums[9 + channel] / POOLED
-    double = 2.0 * tl.load(numbers + TRANSDUCER_EXPONENT)
+    double = 2.0 * numbers[TRANSDUCER_EXPONENT]
     octaves = tl.log2(base)
     return base, tl.exp2(double * (1.0 - octaves) + octaves) / POOLED
 
@@ -257,15 +266,17 @@ def local_difference(
     block: tl.constexpr,
 ):
     """Write the local visual difference (B, 1, h, w)."""
+    numbers = _loaded(numbers)
     node = tl.program_id(0) * block + tl.arange(0, block)
     sizes = (height, width, above, across, top, left)
     images, item, plane, parents = _of_item((details, others, parent, other), sizes)
     sums = _pooled(images, numbers, node, plane, parents, sizes)
     (total,) = _zeros(node, local, 1)
-    for number in tl.static_range(9):
-        base, factor = _unmasked(sums, number // 3, numbers)
-        energy = tl.minimum(sums[number] / base * factor, LARGEST_ENERGY)
-        total += energy * energy * energy
+    for channel in tl.static_range(3):
+        base, factor = _unmasked(sums, channel, numbers)
+        for number in tl.static_range(3 * channel, 3 * channel + 3):
+            energy = tl.minimum(sums[number] / base * factor, LARGEST_ENERGY)
+            total += energy * energy * energy
     tl.store(local + item * plane + node, total, node < plane)
 
 
@@ -293,6 +304,7 @@ def slopes(
 
     ``gradient`` is that by the local visual difference, (B, 1, h, w).
     """
+    numbers = _loaded(numbers)
     node = tl.program_id(0) * block + tl.arange(0, block)
     sizes = (height, width, above, across, top, left)
     images, item, plane, parents = _of_item((details, others, parent, other), sizes)
@@ -300,7 +312,7 @@ def slopes(
     inside = node < plane
     found += 12 * item * plane + node
     by_local = tl.load(gradient + item * plane + node, inside, 0.0)
-    double = 2.0 * tl.load(numbers + TRANSDUCER_EXPONENT)
+    double = 2.0 * numbers[TRANSDUCER_EXPONENT]
     for channel in tl.static_range(3):
         base, factor = _unmasked(sums, channel, numbers)
         gain = tl.exp2(double * (1.0 - tl.log2(base)))
@@ -326,7 +338,7 @@ def _by_details(details, plane, at, inside, sight, numbers, by_weighted, found, 
             (by_contrast,) = _zeros(at, details, 1)
             for channel in tl.static_range(3):
                 by_opponent = by_weighted[3 * channel + orientation] * sight[3 + channel]
-                by_contrast += by_opponent * tl.load(numbers + OPPONENTS + 3 * channel + cone)
+                by_contrast += by_opponent * numbers[OPPONENTS + 3 * channel + cone]
             held = inside & (tl.abs(contrasts[3 * cone + orientation]) < LARGEST)
             by_contrast = tl.where(held, by_contrast, 0.0)
             offset = (3 * cone + orientation) * plane + at
@@ -345,32 +357,32 @@ def _by_details(details, plane, at, inside, sight, numbers, by_weighted, found, 
 def _by_parent(parent, plane, at, inside, sight, numbers, by_sight, found):
     """Write the gradient by parents, from that by their channel weighting."""
     raw = _luminance(parent, plane, at, numbers)
-    luminance = tl.maximum(raw, 0.0) + tl.load(numbers + DARK_LIGHT)
+    luminance = tl.maximum(raw, 0.0) + numbers[DARK_LIGHT]
     # The slopes of the logarithms in `_band` and `_dimmed`, times the natural logarithm of 2.
-    dim, peak = tl.load(numbers + DIM_LUMINANCE), tl.load(numbers + PEAK_LUMINANCE)
+    dim, peak = numbers[DIM_LUMINANCE], numbers[PEAK_LUMINANCE]
     dark = -dim / (luminance * (luminance + dim))
     faint = -peak / (luminance * (luminance + peak))
-    glare = 1.0 / (luminance + tl.load(numbers + GLARE_LUMINANCE))
+    glare = 1.0 / (luminance + numbers[GLARE_LUMINANCE])
     achromatic, _ = _dimmed(luminance, numbers)
     octaves, offset = _band(luminance, numbers)
     # That of the band's shape, by octaves.
-    width, floor = tl.load(numbers + BAND_WIDTH), tl.load(numbers + BAND_FLOOR)
+    width, floor = numbers[BAND_WIDTH], numbers[BAND_FLOOR]
     falling = 1.5 * tl.sqrt(offset) * tl.exp(-offset * tl.sqrt(offset)) / width
     shape = tl.where(octaves > 0.0, -falling, (1.0 - floor) * falling)
     shape = tl.where(tl.abs(octaves) < SMALLEST_OFFSET, 0.0, shape)
-    gain = tl.load(numbers + ACHROMATIC_GAIN) / tl.load(numbers + GAIN) * tl.exp2(-achromatic)
-    by_dimming = tl.load(numbers + ACHROMATIC_DIMMING) * dark
-    by_dimming += tl.load(numbers + GLARE_EXPONENT) * glare
-    by_luminance = gain * shape * tl.load(numbers + PEAK_EXPONENT) * faint / LN2
+    gain = numbers[ACHROMATIC_GAIN] / numbers[GAIN] * tl.exp2(-achromatic)
+    by_dimming = numbers[ACHROMATIC_DIMMING] * dark
+    by_dimming += numbers[GLARE_EXPONENT] * glare
+    by_luminance = gain * shape * numbers[PEAK_EXPONENT] * faint / LN2
     by_luminance = by_sight[3] * (by_luminance - sight[3] * by_dimming)
     chromatic = by_sight[4] * sight[4] + by_sight[5] * sight[5]
-    by_luminance -= chromatic * tl.load(numbers + CHROMATIC_DIMMING) * dark
+    by_luminance -= chromatic * numbers[CHROMATIC_DIMMING] * dark
     by_luminance = tl.where(raw >= 0.0, by_luminance, 0.0)
     for cone in tl.static_range(3):
         light = tl.load(parent + cone * plane + at)
-        adapted = tl.maximum(light, 0.0) + tl.load(numbers + DARK_CONES + cone)
+        adapted = tl.maximum(light, 0.0) + numbers[DARK_CONES + cone]
         by_light = tl.where(light >= 0.0, by_sight[cone] * sight[cone] / adapted, 0.0)
-        by_mean = by_luminance * tl.load(numbers + LUMINANCE_OF_CONES + cone)
+        by_mean = by_luminance * numbers[LUMINANCE_OF_CONES + cone]
         tl.store(found + cone * plane + at, by_mean - by_light, inside)
 
 
@@ -400,6 +412,7 @@ def gradients(
 
     ``first``, ``second``: whether those of the first and of the second image are wanted.
     """
+    numbers = _loaded(numbers)
     node = tl.program_id(0) * block + tl.arange(0, block)
     sizes = (height, width, above, across, top, left)
     images, item, plane, parents = _of_item((details, others, parent, other), sizes)
