@@ -70,7 +70,7 @@ def local_differences(
     ValueError
         If the images are where Triton cannot run.
     """
-    kernels = _kernels(first.mean.device)
+    kernels = kernels_on(first.mean.device)
     numbers = kernels.numbers_of(levels, model.constants)
     return tuple(
         _of_level(kernels, model, first, second, number, numbers[number], levels.only)
@@ -82,7 +82,7 @@ def local_difference(
     model: Model, first: Cortex, second: Cortex, number: int, level: Level
 ) -> Tensor:
     """Return `Model.local_difference` of a level, likewise."""
-    kernels = _kernels(first.mean.device)
+    kernels = kernels_on(first.mean.device)
     numbers = kernels.numbers_of([part.flatten().unsqueeze(0) for part in level], model.constants)
     return _of_level(kernels, model, first, second, number, numbers[0], lambda _: level)
 
@@ -115,8 +115,8 @@ def _of_level(
     return local
 
 
-def _kernels(device: torch.device) -> Any:
-    """Return the module of the kernels, if it can run on a device."""
+def kernels_on(device: torch.device) -> Any:
+    """Return the module of the kernels; raise ValueError if they cannot run on a device."""
     from torch_vdm.run import triton_level
 
     if device.type == "meta" or (device.type == "cpu" and not triton_level.INTERPRETED):
