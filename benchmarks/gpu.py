@@ -1,8 +1,9 @@
 """Time, memory and equality on a CUDA device, beside other metrics on the same.
 
-Maps and training steps, eager, compiled and replayed from a CUDA graph; each round runs every
-contender once, and the device has done all of it before the clock stops. With ``--quick`` and
-without such a device it is a smoke test on the processor, where nothing is captured.
+Maps and training steps, eager, compiled, with the kernel of Triton and replayed from a CUDA graph;
+each round runs every contender once, and the device has done all of it before the clock stops. With
+``--quick`` and without such a device it is a smoke test on the processor, where nothing is captured
+and there is no kernel.
 
 LPIPS is measured where the package ``lpips`` and its weights are.
 """
@@ -21,7 +22,7 @@ import torch
 from torch import Tensor
 
 from benchmarks import peers
-from benchmarks.launches import step
+from benchmarks.launches import of_a_gpu, step
 from benchmarks.record import blank_figure, caption, circumstances, save
 from benchmarks.rungs import RUNGS
 from benchmarks.scenes import STILL_LIFE, scene_file, sized
@@ -39,7 +40,7 @@ QUICK_SIZES = ((176, 192),)
 OPTIONS: dict[str, Any] = {"nonfinite": "mask", "effects": "full"}
 
 # What is replayed from a CUDA graph too.
-CAPTURED = (*RUNGS, "VDMLoss")
+CAPTURED = (*RUNGS, "fast, kernel", "VDMLoss", "VDMLoss, kernel")
 
 # Calls of every contender, and those before, which compile and allocate.
 ROUNDS, FIRST = 30, 5
@@ -79,8 +80,9 @@ def run(quick: bool, output: Path | None) -> None:
         for dtype in precisions
         for shape in (batch, (1, *sizes[-1 if quick else -2]))
     ]
-    result["equal"] = {name: _equality(name, device, sizes[0]) for name in RUNGS}
-    result["waits"] = {name: _waits(name, device) for name in RUNGS}
+    metrics = _metrics(device).items()
+    result["equal"] = {name: _equality(options, device, sizes[0]) for name, options in metrics}
+    result["waits"] = {name: _waits(options, device) for name, options in metrics}
     result["renderer"] = _renderer(64 if quick else SIDE, 4 if quick else SPP)
     table = _table(result)
     print(table)
@@ -96,6 +98,16 @@ def _card(device: torch.device) -> str:
 # What is timed.
 
 
+def _metrics(device: torch.device) -> dict[str, dict[str, Any]]:
+    """Return the options of our metrics by name; the kernel is for a GPU alone."""
+    found: dict[str, dict[str, Any]] = {
+        name: {**OPTIONS, "transform": transform} for name, transform in RUNGS.items()
+    }
+    if device.type == "cuda":
+        found["fast, kernel"] = {**OPTIONS, "schedule": of_a_gpu(False, kernel=True)}
+    return found
+
+
 def _maps(device: torch.device, quick: bool, missing: dict[str, str]) -> dict[str, Function]:
     """Return metrics by name; those that are not here are named in ``missing``."""
     found: dict[str, Function] = {"kornia SSIM": kornia_ssim()}
@@ -109,8 +121,8 @@ def _maps(device: torch.device, quick: bool, missing: dict[str, str]) -> dict[st
             found[name] = make()
         except (ImportError, OSError) as error:
             missing[name] = f"not there: {error}"
-    for name, transform in RUNGS.items():
-        found[name] = VDM(transform=transform, **OPTIONS).to(device)
+    for name, options in _metrics(device).items():
+        found[name] = VDM(**options).to(device)
     if not quick:  # a smoke test would compile for half a minute
         found["fast, compiled"] = VDM(**OPTIONS).to(device).compile()
     return found
@@ -122,6 +134,9 @@ def _steps(device: torch.device, quick: bool) -> dict[str, Function]:
         "kornia SSIM loss": kornia_ssim_loss(),
         "VDMLoss": VDMLoss(**OPTIONS).to(device),
     }
+    if device.type == "cuda":
+        schedule = of_a_gpu(True, kernel=True)
+        losses["VDMLoss, kernel"] = VDMLoss(schedule=schedule, **OPTIONS).to(device)
     if not quick:
         fast = VDMLoss(**OPTIONS).to(device).compile()
         losses["VDMLoss, compiled"] = fast
@@ -235,21 +250,20 @@ def _peak(device: torch.device) -> Iterator[list[float]]:
 # What must hold.
 
 
-def _equality(name: str, device: torch.device, size: tuple[int, int]) -> float:
+def _equality(options: dict[str, Any], device: torch.device, size: tuple[int, int]) -> float:
     """Return the largest difference between this device's map and the processor's, as a share."""
     pair = images(size)
-    metric = VDM(transform=RUNGS[name], **OPTIONS)
     with torch.no_grad():
-        expected = metric(*pair)
-        found = metric.to(device)(*(image.to(device) for image in pair)).cpu()
+        expected = VDM(**{**options, "schedule": None})(*pair)
+        found = VDM(**options).to(device)(*(image.to(device) for image in pair)).cpu()
     return float(((found - expected).abs() / expected.clamp_min(1e-3)).amax())
 
 
-def _waits(name: str, device: torch.device) -> bool:
+def _waits(options: dict[str, Any], device: torch.device) -> bool:
     """Return whether a map makes the processor wait for the device."""
     if device.type != "cuda":
         return False
-    metric = VDM(transform=RUNGS[name], **OPTIONS).to(device)
+    metric = VDM(**options).to(device)
     pair = [image.to(device) for image in images((128, 128))]
     with torch.no_grad():
         metric(*pair)

@@ -1,12 +1,18 @@
 """How many operations a map and a training step are: what a GPU waits for Python.
 
 Counted on the processor, with the schedule that a GPU gets: every operation that PyTorch
-dispatches, but for views, which start no kernel. No time is measured.
+dispatches, but for views, which start no kernel; and every launch of a kernel of Triton, which is
+not run. No time is measured.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -16,6 +22,7 @@ from benchmarks.record import caption, circumstances, save
 from benchmarks.rungs import RUNGS
 from benchmarks.speed import BATCH, FULL_HD, PATCH, ssim, ssim_loss
 from torch_vdm import VDM, VDMLoss
+from torch_vdm.run import kernel
 from torch_vdm.run.schedule import Job, Schedule, chosen
 
 # What is wanted of the default metric: a map, and a loss with its gradient.
@@ -54,13 +61,17 @@ def run(quick: bool, output: Path | None) -> None:
     for name, transform in rungs.items():
         # Read back once an image, where asked for, and no kernel of the map's.
         options: dict[str, Any] = {"transform": transform, "nonfinite": "mask", "effects": "full"}
-        maps[name] = VDM(**options, schedule=_of_a_gpu(False))
+        maps[name] = VDM(**options, schedule=of_a_gpu(False))
         maps[f"{name}, a processor's"] = VDM(**options)
-        losses[name] = VDMLoss(**options, schedule=_of_a_gpu(True))
+        losses[name] = VDMLoss(**options, schedule=of_a_gpu(True))
         losses[f"{name}, a processor's"] = VDMLoss(**options)
-    with torch.no_grad():
-        result["map"] = {name: count(function, *pair) for name, function in maps.items()}
-    result["loss"] = {name: count(step(loss), *batch) for name, loss in losses.items()}
+        if name == "fast" and find_spec("triton"):
+            maps["fast, kernel"] = VDM(**options, schedule=of_a_gpu(False, kernel=True))
+            losses["fast, kernel"] = VDMLoss(**options, schedule=of_a_gpu(True, kernel=True))
+    with _launched() if find_spec("triton") else nullcontext():
+        with torch.no_grad():
+            result["map"] = {name: count(function, *pair) for name, function in maps.items()}
+        result["loss"] = {name: count(step(loss), *batch) for name, loss in losses.items()}
     result["wanted"] = WANTED
     table = _table(result)
     print(table)
@@ -76,20 +87,39 @@ def count(function: Contender, test: Tensor, reference: Tensor) -> int:
     return int(counter.count)
 
 
-def _of_a_gpu(gradients: bool) -> Schedule:
-    return chosen(
-        Job(
-            items=1,
-            size=FULL_HD,
-            stackable=True,
-            gradients=gradients,
-            one_sided=gradients,  # of a loss, by its test alone
-            compiles=False,
-            checkpoints=False,
-            accelerated=True,
-            traced=False,
-        )
+def of_a_gpu(gradients: bool, kernel: bool = False) -> Schedule:
+    """Return the schedule that a GPU gets, and with the kernel if asked for."""
+    job = Job(
+        items=1,
+        size=FULL_HD,
+        stackable=True,
+        gradients=gradients,
+        one_sided=gradients,  # of a loss, by its test alone
+        compiles=False,
+        checkpoints=False,
+        accelerated=True,
+        traced=False,
     )
+    return replace(chosen(job), kernel=kernel)
+
+
+class _OneOperation:
+    """Stands for a kernel of Triton: a launch is one operation, and computes nothing."""
+
+    def __getitem__(self, grid: tuple[int, int]) -> Callable[..., Tensor]:
+        return lambda *planes, **_: planes[0].clone()
+
+
+@contextmanager
+def _launched() -> Iterator[None]:
+    """Let the kernel be launched where there is no GPU."""
+    from torch_vdm.run import triton_level
+
+    names = ("local_difference", "slopes", "gradients")
+    kernels = SimpleNamespace(numbers_of=triton_level.numbers_of)
+    vars(kernels).update((name, _OneOperation()) for name in names)
+    with patch.object(kernel, "kernels_on", lambda _: kernels):
+        yield
 
 
 def step(loss: Contender) -> Contender:

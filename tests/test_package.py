@@ -11,7 +11,7 @@ from benchmarks.places import ROOT
 def test_heavy_packages_are_imported_where_they_are_used() -> None:
     heavy = {
         *("kornia", "matplotlib", "OpenEXR", "PIL", "rich", "tifffile", "torchmetrics"),
-        "torch._dynamo",
+        *("torch._dynamo", "triton"),
     }
     code = f"import sys, torch_vdm; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)

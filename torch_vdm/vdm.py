@@ -25,7 +25,7 @@ from torch_vdm.options import choice
 from torch_vdm.pair import Nonfinite, Numbers, PairMetric
 from torch_vdm.plan import Plan, everything, is_grey, plan_of
 from torch_vdm.precision import computed_in
-from torch_vdm.run import regions, strips, whole
+from torch_vdm.run import kernel, regions, strips, whole
 from torch_vdm.run.schedule import Schedule, chosen
 from torch_vdm.run.tiles import Done, Progress, in_tiles
 from torch_vdm.run.tiling import TILE, Source, check_sources, read
@@ -117,6 +117,8 @@ class VDM(PairMetric):
                 f"expected a schedule that is not stacked with {self.transform}, got one that is; "
                 "items lie below one another with Haar() alone"
             )
+        if schedule is not None and schedule.kernel:
+            kernel.require(schedule, self.observer, self.transform, self.effects)
         self.schedule = schedule
 
         peaks = [self.transform.peaks(level) for level in range(DEEPEST)]
@@ -209,7 +211,15 @@ class VDM(PairMetric):
             return replace(everything(names, len(test)), grey=True)
         job = self._job(test, reference)
         reads = self.nonfinite == "raise" and test.device.type == "cpu" and can_be_read(test)
-        if not self._planned or job.gradients or job.compiles or job.traced or not reads:
+        by_kernel = self.schedule is not None and self.schedule.kernel  # of all there is
+        if (
+            not self._planned
+            or job.gradients
+            or job.compiles
+            or job.traced
+            or by_kernel
+            or not reads
+        ):
             return everything(names, len(test))
         may = self.observer.charging and self.transform.csf == "levels"
         return plan_of(test, reference, names, may)

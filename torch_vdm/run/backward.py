@@ -50,10 +50,14 @@ def local_difference_by_hand(
 
 
 def by_hand() -> bool:
-    """Return whether this gradient can be used: nothing traces or transforms the computation."""
+    """Return whether this gradient can be used, and is of use."""
+    return torch.is_grad_enabled() and is_plain()
+
+
+def is_plain() -> bool:
+    """Return whether nothing traces or transforms the computation."""
     return (
-        torch.is_grad_enabled()
-        and not torch.compiler.is_compiling()
+        not torch.compiler.is_compiling()
         and not torch._C._are_functorch_transforms_active()
         and forward_ad._current_level < 0
     )

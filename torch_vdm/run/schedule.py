@@ -73,6 +73,8 @@ class Schedule(Steps):
     """As `Steps.cached`."""
     few: int = field(default_factory=lambda: FEW_NODES)
     """Levels of at most this many nodes are computed at once."""
+    kernel: bool = False
+    """Whether a level's difference is a kernel of Triton; see `torch_vdm.run.kernel`."""
 
     @property
     def fused(self) -> bool:

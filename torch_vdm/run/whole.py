@@ -21,6 +21,7 @@ from torch_vdm.model.level import (
     summed_across,
 )
 from torch_vdm.model.model import Model, weights_alone
+from torch_vdm.run import kernel
 from torch_vdm.run import schedule as limits
 from torch_vdm.run.backward import by_hand, local_difference_by_hand
 from torch_vdm.run.column import Column, cells_of, column_of
@@ -58,6 +59,8 @@ def local_differences(
 ) -> tuple[Tensor, ...]:
     """Return `Model.local_differences`, dropping the responses of a level once they are used."""
     levels = model.levels(first.finest, len(first.details))
+    if schedule.kernel and kernel.is_usable(model):
+        return kernel.local_differences(model, first, second, levels)
     few = _few(schedule, first.details)
     return (
         *_of_few(model, schedule, first, second, few, levels),
@@ -72,6 +75,8 @@ def level_difference(
     model: Model, schedule: Schedule, first: Cortex, second: Cortex, number: int, level: Level
 ) -> Tensor:
     """Return `Model.local_difference` of a level."""
+    if schedule.kernel and kernel.is_usable(model):
+        return kernel.local_difference(model, first, second, number, level)
     details, others = first.details[number], second.details[number]
     options = model.options()
     sights = model.sights(level, (first, second), number)

@@ -1,0 +1,294 @@
+"""The kernel of a level, run by Triton's interpreter, against the model's own steps."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from benchmarks.places import ROOT
+from torch_vdm import VDM, Effects, Haar, Observer, Steerable, VDMLoss
+from torch_vdm.model.cortex import Cortex
+from torch_vdm.model.grid import Grid
+from torch_vdm.run import kernel
+from torch_vdm.run import schedule as limits
+from torch_vdm.run.schedule import Schedule
+
+pytest.importorskip("triton", reason="Triton is not installed")
+
+PLAIN, KERNEL = Schedule(), Schedule(kernel=True)
+
+# What the interpreter takes long for is a program, however many nodes it has.
+BLOCK, LARGE_BLOCK = 64, 4096
+
+# Of float32 and float64, relative: log2 and the order of sums are others.
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def interpreted() -> Iterator[None]:
+    # Set while the kernels are made, and only then: other tests compile by Triton.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TRITON_INTERPRET", "1")
+        from torch_vdm.run import triton_level
+    assert triton_level.INTERPRETED
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernel, "BLOCK", BLOCK)
+        yield
+
+
+def level_of(
+    kind: str, size: tuple[int, int], before: tuple[int, int], batch: int, dtype: torch.dtype
+) -> tuple[Cortex, Cortex]:
+    """Return two images of two levels, of which the second has nodes of ``size``."""
+    generator = torch.Generator().manual_seed(sum(size))
+    parents = [(side + first + 1) // 2 for side, first in zip(size, before, strict=True)]
+
+    def image() -> Cortex:
+        details = torch.randn(batch, 3, 3, *size, generator=generator, dtype=torch.float64)
+        light = torch.rand(batch, 3, *parents, generator=generator, dtype=torch.float64)
+        match kind:
+            case "pictures" | "a picture and black":
+                details, light = 10.0 * details, 100.0 * light
+            case "faint":
+                details, light = 1e-3 * details, 100.0 * light
+            case "in the dark":
+                details, light = 1e-6 * details, 1e-5 * light
+            case "out of gamut":  # and far beyond the largest difference
+                details, light = 1e9 * details, light - 0.5
+        planes = details.to(dtype), light.to(dtype)
+        root = planes[0].new_zeros(batch, 3, 3, *parents)
+        grid = Grid(*((0, first) for first in before))
+        mean = planes[1].mean((-2, -1), keepdim=True)
+        return Cortex((root, planes[0]), (planes[1], planes[0][:, :, 0]), mean, grid=grid)
+
+    first, second = image(), image()
+    return first, second.each(torch.zeros_like) if kind == "a picture and black" else second
+
+
+def of_level(
+    schedule: Schedule, first: Cortex, second: Cortex, wanted: tuple[bool, bool] | None = None
+) -> list[Tensor]:
+    """Return the local visual difference of the second level, and what gradients are wanted."""
+    model = VDM(30.0).model(first.mean.dtype)
+    if wanted is not None:
+        first, second = (
+            cortex.each(lambda plane, want=want: plane.clone().requires_grad_(want))
+            for cortex, want in zip((first, second), wanted, strict=True)
+        )
+    level = model.levels(0, 2).only(1)
+    if schedule.kernel:
+        local = kernel.local_difference(model, first, second, 1, level)
+    else:
+        local = model.local_difference(first, second, 1, level)
+    if wanted is None:
+        return [local]
+    weights = torch.linspace(0.5, 2.0, local.numel(), dtype=local.dtype).view_as(local)
+    planes = [
+        plane
+        for cortex, want in zip((first, second), wanted, strict=True)
+        if want
+        for plane in (cortex.details[1], cortex.lowpass[0])
+    ]
+    return [local.detach(), *torch.autograd.grad((local * weights).sum(), planes)]
+
+
+def assert_close(actual: list[Tensor], expected: list[Tensor]) -> None:
+    assert len(actual) == len(expected)
+    for mine, plain in zip(actual, expected, strict=True):
+        assert mine.dtype == plain.dtype
+        assert mine.isfinite().all()
+        tolerance, largest = TOLERANCE[plain.dtype], float(plain.abs().max())
+        torch.testing.assert_close(mine, plain, rtol=tolerance, atol=tolerance * largest)
+
+
+KINDS = ("pictures", "a picture and black", "faint", "in the dark", "out of gamut")
+
+
+@pytest.mark.parametrize(
+    ("size", "before", "batch", "dtype"),
+    [
+        ((1, 1), (0, 0), 3, torch.float32),
+        ((1, 7), (0, 1), 1, torch.float32),
+        ((2, 4097), (1, 1), 1, torch.float32),
+        ((33, 65), (1, 0), 3, torch.float32),
+        ((7, 5), (0, 1), 1, torch.float64),
+    ],
+    ids=str,
+)
+def test_a_level_is_the_models(
+    size: tuple[int, int],
+    before: tuple[int, int],
+    batch: int,
+    dtype: torch.dtype,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(kernel, "BLOCK", LARGE_BLOCK)
+    images = level_of("pictures", size, before, batch, dtype)
+    (plain,) = of_level(PLAIN, *images)
+    (mine,) = of_level(KERNEL, *images)
+    torch.testing.assert_close(mine, plain, rtol=TOLERANCE[dtype], atol=0.0)
+    assert torch.count_nonzero(of_level(KERNEL, images[0], images[0])[0]) == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "dtype"),
+    [*((kind, torch.float32) for kind in KINDS), ("pictures", torch.float64)],
+    ids=str,
+)
+def test_gradients_are_autograds(kind: str, dtype: torch.dtype) -> None:
+    images = level_of(kind, (5, 11), (1, 0), 1, dtype)
+    wanted = (True, True)
+    assert_close(of_level(KERNEL, *images, wanted), of_level(PLAIN, *images, wanted))
+
+
+@pytest.mark.parametrize(
+    ("size", "before", "batch"), [((1, 1), (0, 0), 2), ((2, 33), (0, 1), 1)], ids=str
+)
+def test_gradients_of_several_programs(
+    size: tuple[int, int], before: tuple[int, int], batch: int
+) -> None:
+    images = level_of("pictures", size, before, batch, torch.float64)
+    wanted = (True, True)
+    assert_close(of_level(KERNEL, *images, wanted), of_level(PLAIN, *images, wanted))
+
+
+def test_gradients_of_equal_images_are_0() -> None:
+    image, _ = level_of("pictures", (3, 2), (0, 0), 1, torch.float32)
+    local, *gradients = of_level(KERNEL, image, image, (True, True))
+    assert not any(plane.any() for plane in (local, *gradients))
+
+
+@pytest.mark.parametrize("wanted", [(True, False), (False, True)], ids=str)
+def test_only_what_is_wanted(wanted: tuple[bool, bool]) -> None:
+    images = level_of("pictures", (5, 4), (0, 1), 1, torch.float64)
+    assert_close(of_level(KERNEL, *images, wanted), of_level(PLAIN, *images, wanted))
+
+
+def pair(height: int, width: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    test, reference = torch.rand(2, 1, 3, height, width, dtype=torch.float64, generator=generator)
+    return test, reference
+
+
+def map_and_gradients(schedule: Schedule, images: tuple[Tensor, Tensor]) -> list[Tensor]:
+    metric, loss = VDM(30.0, schedule=schedule), VDMLoss(30.0, schedule=schedule)
+    leaves = [image.clone().requires_grad_() for image in images]
+    with torch.no_grad():
+        jnd = metric(*images)
+    return [jnd, *torch.autograd.grad(loss(*leaves), leaves)]
+
+
+def test_maps_and_losses() -> None:
+    images = pair(5, 6)
+    schedule = Schedule(kernel=True, together=True, cached=False, few=limits.EVERY_LEVEL)
+    actual, expected = (map_and_gradients(each, images) for each in (schedule, PLAIN))
+    assert_close(actual, expected)
+
+
+def test_grey_images_too() -> None:
+    image, other = (plane[:, :1].expand(-1, 3, -1, -1) for plane in pair(4, 3))
+    assert not VDM(schedule=KERNEL).plan(image, other).grey
+    torch.testing.assert_close(VDM(schedule=KERNEL)(image, other), VDM()(image, other))
+
+
+def test_strips_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "STRIP", 512)
+    monkeypatch.setattr(kernel, "BLOCK", LARGE_BLOCK)
+    images = pair(66, 17)
+    strips = VDM(schedule=Schedule("strips", kernel=True))
+    torch.testing.assert_close(strips(*images), VDM()(*images))
+
+
+def test_the_gradient_of_the_gradient_is_autograds() -> None:
+    images = pair(3, 2)
+    found = []
+    for schedule in (KERNEL, PLAIN):
+        leaves = [image.clone().requires_grad_() for image in images]
+        loss = VDMLoss(schedule=schedule)(*leaves)
+        slopes = torch.autograd.grad(loss, leaves, create_graph=True)
+        total = torch.stack([slope.square().sum() for slope in slopes]).sum()
+        found.append([loss.detach(), *torch.autograd.grad(total, leaves)])
+    assert_close(*found)
+
+
+def test_what_it_cannot_do_is_done_by_the_models_steps() -> None:
+    images = pair(6, 5)
+    found = []
+    for schedule in (KERNEL, PLAIN):
+        metric = VDM(schedule=schedule, nonfinite="mask")
+        (slope,) = torch.func.grad(lambda *pair: metric.power(*pair).sum(), (0,))(*images)  # noqa: B023
+        constant = metric.get_buffer("opponents").requires_grad_()
+        power = metric.power(*images)
+        found.append([slope, *torch.autograd.grad(power.sum(), constant)])
+    assert_close(*found)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"observer": Observer.paper()}, 'with the observer "paper"'),
+        (
+            {"observer": dataclasses.replace(Observer.calibrated(), summation_exponent=4.0)},
+            "with the observer",
+        ),
+        ({"transform": Steerable()}, "with Steerable"),
+        ({"transform": Haar("filter")}, "with Haar"),
+        ({"effects": Effects(pooling=False)}, "with effects left out"),
+        ({"schedule": Schedule(kernel=True, stacked=True)}, "stacked"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_has_no_kernel_is_refused(options: dict[str, Any], told: str) -> None:
+    with pytest.raises(ValueError, match="expected a schedule without the kernel") as refused:
+        VDM(**{"schedule": KERNEL, **options})
+    assert told in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_missing_triton_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernel, "find_spec", lambda _: None)
+    with pytest.raises(ValueError, match=r"expected Triton .*: pip install triton"):
+        VDM(schedule=KERNEL)
+
+
+def test_without_a_gpu_it_is_refused_and_still_compiled_for_one(tmp_path: Path) -> None:
+    # In a process without the interpreter.
+    code = """
+import torch, triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from torch_vdm import VDM
+from torch_vdm.run import triton_level
+from torch_vdm.run.schedule import Schedule
+image = torch.rand(1, 3, 8, 8)
+try:
+    VDM(schedule=Schedule(kernel=True))(image, image)
+except ValueError as error:
+    print(error)
+for kernel in (triton_level.local_difference, triton_level.slopes, triton_level.gradients):
+    constants = {name: True for name in kernel.arg_names if name in ("first", "second")}
+    constants["block"] = 128
+    types = {name: "*fp32" for name in triton_level.PLANES}
+    types |= {name: "i32" for name in triton_level.SIZES}
+    types |= {name: "constexpr" for name in constants}
+    source = ASTSource(kernel, {name: types[name] for name in kernel.arg_names}, constants)
+    compiled = triton.compile(source, GPUTarget("cuda", 80, 32), {"enable_fp_fusion": False})
+    print(len(compiled.asm["cubin"]) > 0)
+"""
+    environment = os.environ | {"TRITON_CACHE_DIR": str(tmp_path), "TRITON_INTERPRET": "0"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    refusal, *compiled = done.stdout.splitlines()
+    assert refusal.startswith(
+        "expected images on a GPU for a schedule with the kernel, got them on"
+    )
+    assert compiled == ["True"] * 3
