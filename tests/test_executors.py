@@ -169,7 +169,7 @@ JOB = Job(1, (400, 400), True, False, False, False, False, False, False)
             dataclasses.asdict(ACCELERATED) | {"again": True, "few": limits.FEW_NODES},
         ),
         # A graph that somebody else makes has all of it, in one piece.
-        ({"size": (1080, 1920), "compiles": True, "traced": True}, {}),
+        ({"size": (1080, 1920), "compiles": True, "traced": True}, {"few": 0}),
     ],
     ids=str,
 )

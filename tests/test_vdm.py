@@ -382,7 +382,7 @@ def test_images_of_two_devices_are_refused() -> None:
         (lambda: untyped.VDM(transform="haar"), r"transform: Haar\(\).*, got 'haar'"),
         (lambda: untyped.VDM(transform=untyped.Observer.paper()), r"transform: Haar\(\)"),
         (lambda: untyped.VDM(observer=untyped.Observer.paper), "observer: Observer"),
-        (lambda: untyped.VDM(effects={"masking": False}), '"full" or Effects'),
+        (lambda: untyped.VDM(effects={"masking": False}), '"full", Effects or Plan'),
         (lambda: untyped.VDM(nonfinite=["mask"]), 'nonfinite "raise" or "mask"'),
         (lambda: untyped.VDM.sarnoff("60"), "pixels per degree: a number"),
         (lambda: untyped.VDM.sarnoff(resample="no"), "resample: True or False, got 'no'"),

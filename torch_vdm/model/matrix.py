@@ -28,9 +28,12 @@ def mix(matrix: Tensor, planes: Tensor) -> Tensor:
     # All rows at once, a channel at a time: nearly twice as fast as a row at a time.
     matrix = matrix.reshape(*matrix.shape, *[1] * (planes.ndim - matrix.ndim))
     columns = matrix.unbind(1)
+    # `torch.vmap` has no rule for the one in place.
+    transformed = torch._C._are_functorch_transforms_active()
+    added = torch.addcmul if transformed else Tensor.addcmul_
     mixed = planes[:, :1] * columns[0]
     for number, column in enumerate(columns[1:], 1):
-        mixed.addcmul_(planes[:, number : number + 1], column)
+        mixed = added(mixed, planes[:, number : number + 1], column)
     return mixed
 
 
