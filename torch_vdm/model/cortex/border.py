@@ -146,6 +146,8 @@ def analyse_at_border(even: Tensor, down: Down, across: Across) -> tuple[Tensor,
     They are (B, C, h, w), (B, C, 3, h, w) and (B, C, h, w). ``down`` and ``across`` are the weights
     of the pairs along h and w.
     """
+    if torch.compiler.is_compiling():
+        return _one_by_one(even, down, across)
     left, right = even[..., 0::2].unsqueeze(2), even[..., 1::2].unsqueeze(2)
     # Across: the mean of their own pixels, that for d2 and the window, the detail for d1 and d3.
     both = torch.addcmul(right * across.on_right, across.weights, left - right)
@@ -153,10 +155,28 @@ def analyse_at_border(even: Tensor, down: Down, across: Across) -> tuple[Tensor,
     between = top - bottom
     means = torch.addcmul(bottom, down.weights, between)
     details = torch.cat((means[:, :, 2:], down.half * between[:, :, 1:]), 2)
-    lowpass, window = means[:, :, 0], means[:, :, 1]
-    if torch.compiler.is_compiling():  # compiled code is specialised on views
-        return lowpass.contiguous(), details, window.contiguous()
-    return lowpass, details, window
+    return means[:, :, 0], details, means[:, :, 1]
+
+
+def _one_by_one(even: Tensor, down: Down, across: Across) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the same in more operations, of which a compiler makes a kernel four times as fast."""
+    (own, completed, half), (own_down, completed_down, _) = (
+        of.weights[0].unbind() for of in (across, down)
+    )
+    half_down = down.half[0, 0]
+    left, right = even[..., 0::2], even[..., 1::2]
+    between = left - right
+    means, seen = torch.addcmul(right, own, between), torch.addcmul(right, completed, between)
+    detail = half * between
+    top, bottom = means[..., 0::2, :], means[..., 1::2, :]
+    lowpass = torch.addcmul(bottom, own_down, top - bottom)
+    top, bottom = detail[..., 0::2, :], detail[..., 1::2, :]
+    between = top - bottom
+    horizontal, diagonal = torch.addcmul(bottom, completed_down, between), half_down * between
+    top, bottom = seen[..., 0::2, :], seen[..., 1::2, :]
+    between = top - bottom
+    window = torch.addcmul(bottom, completed_down, between)
+    return lowpass, torch.stack((horizontal, half_down * between, diagonal), 2), window
 
 
 def means_at_border(even: Tensor, down: Down, across: Across) -> tuple[Tensor]:
