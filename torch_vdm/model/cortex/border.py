@@ -43,18 +43,18 @@ class Across(NamedTuple):
     """The weights of all n pairs along w."""
 
     weights: Tensor
-    """(1, 3, 1, n): w of the mean of their own pixels, w of that for the details, and h."""
+    """(1, 3, 1, 1, n): w of the mean of their own pixels, w of that for the details, and h."""
     on_right: Tensor
-    """(1, 3, 1, 1): what the right one counts for beside the difference of the two, 1, 1 and 0."""
+    """(1, 3, 1, 1, 1): how often the right one counts beside their difference, 1, 1 and 0."""
 
 
 class Down(NamedTuple):
     """The weights of all n pairs along h."""
 
     weights: Tensor
-    """(1, 3, n, 1): w of the mean of their own pixels, and twice that for the details."""
+    """(1, 3, 1, n, 1): w of the mean of their own pixels, and twice that for the details."""
     half: Tensor
-    """(1, 1, n, 1): h of the details."""
+    """(1, 1, 1, n, 1): h of the details."""
 
 
 def is_inside(side: Side, nodes: int) -> bool:
@@ -111,10 +111,11 @@ def _made(
         return torch.tensor(of, dtype=dtype, device=device)
 
     (own, completed, half), across = (_rows(side, n) for side, n in zip(sides, nodes, strict=True))
-    down = [[[weight] for weight in row] for row in (own, completed, completed)]
+    down = [[[[weight] for weight in row]] for row in (own, completed, completed)]
+    on_right = [[[[1.0]]], [[[1.0]]], [[[0.0]]]]
     return (
-        Down(tensor([down]), tensor([[[[weight] for weight in half]]])),
-        Across(tensor([[[row] for row in across]]), tensor([[[[1.0]], [[1.0]], [[0.0]]]])),
+        Down(tensor([down]), tensor([[[[[weight] for weight in half]]]])),
+        Across(tensor([[[[row]] for row in across]]), tensor([on_right])),
     )
 
 
@@ -148,14 +149,14 @@ def analyse_at_border(even: Tensor, down: Down, across: Across) -> tuple[Tensor,
     """
     if torch.compiler.is_compiling():
         return _one_by_one(even, down, across)
-    left, right = even[..., 0::2].unsqueeze(2), even[..., 1::2].unsqueeze(2)
+    left, right = even[:, None, ..., 0::2], even[:, None, ..., 1::2]
     # Across: the mean of their own pixels, that for d2 and the window, the detail for d1 and d3.
     both = torch.addcmul(right * across.on_right, across.weights, left - right)
     top, bottom = both[..., 0::2, :], both[..., 1::2, :]
     between = top - bottom
-    means = torch.addcmul(bottom, down.weights, between)
-    details = torch.cat((means[:, :, 2:], down.half * between[:, :, 1:]), 2)
-    return means[:, :, 0], details, means[:, :, 1]
+    lowpass, window, horizontal = torch.addcmul(bottom, down.weights, between).unbind(1)
+    vertical, diagonal = (down.half * between[:, 1:]).unbind(1)
+    return lowpass, torch.stack((horizontal, vertical, diagonal), 2), window
 
 
 def _one_by_one(even: Tensor, down: Down, across: Across) -> tuple[Tensor, Tensor, Tensor]:
@@ -182,6 +183,6 @@ def _one_by_one(even: Tensor, down: Down, across: Across) -> tuple[Tensor, Tenso
 def means_at_border(even: Tensor, down: Down, across: Across) -> tuple[Tensor]:
     """Return the lowpass of `analyse_at_border` alone."""
     left, right = even[..., 0::2], even[..., 1::2]
-    own = torch.addcmul(right, across.weights[:, :1], left - right)
+    own = torch.addcmul(right, across.weights[:, 0], left - right)
     top, bottom = own[..., 0::2, :], own[..., 1::2, :]
-    return (torch.addcmul(bottom, down.weights[:, :1], top - bottom),)
+    return (torch.addcmul(bottom, down.weights[:, 0], top - bottom),)
