@@ -291,10 +291,10 @@ def response_difference_at(
 ) -> Tensor:
     """Return `response_difference` where the parents are given for every node.
 
-    ``around`` is what `sights_of` takes.
+    ``around`` is what `sights_of` takes; both images share the parents of one.
     """
-    first, second = sights_of(*around)
-    return response_difference(details, other_details, first, second, options)
+    sights = sights_of(*around)
+    return response_difference(details, other_details, sights[0], sights[-1], options)
 
 
 def sights_of(

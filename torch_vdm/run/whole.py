@@ -149,9 +149,10 @@ def _column_difference(
         return response_difference(details[0], details[1], sight, sight, options)
     # All but the finest of these levels have the parents of others.
     most = max(len(column.sizes) - 1, 1)
-    parents = [
-        column.of_parents(column.of((cortex.windows or cortex.lowpass)[:most])) for cortex in images
-    ]
+    above = [(cortex.windows or cortex.lowpass)[:most] for cortex in images]
+    # Images that are compared at the same light share it, and what follows from it.
+    one = all(plane is other for plane, other in zip(*above, strict=True))
+    parents = [column.of_parents(column.of(planes)) for planes in above[: 1 if one else 2]]
     seen_at = parents, level, *model.sight_options()
     difference: Tensor = schedule(response_difference_at, *details, seen_at, options)
     return difference
