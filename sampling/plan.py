@@ -25,7 +25,7 @@ from sampling.renderers import Samples
 from sampling.renderers.bounces import BOTH, LIGHTS, MATERIALS
 from sampling.renderers.mitsuba import Bounced, MitsubaRenderer
 from sampling.renderers.needs import PATH, Needs
-from sampling.sampler import Request, Sampler, Settings
+from sampling.sampler import Report, Request, Sampler, Settings
 from sampling.statistics import Statistics
 
 # The values of `effects`.
@@ -55,7 +55,7 @@ STEEP = 2.3
 # The rest must cost at most this share, or everything is kept. Status: choice.
 WORTH = 0.95
 
-# Lights or materials alone must cost at most this share of both. Status: choice.
+# Lights or materials alone must cost at most this share of both, of a whole run. Status: choice.
 WORTH_ALONE = 0.9
 
 # Standard deviation of a sample, of its mean, that is added to all noise before noises are
@@ -285,7 +285,7 @@ class Pilot:
         if found_by != BOTH:
             alone = self._of([each.alone for each in held], held, look)
             times = self._times_the_samples(chosen, alone, held)
-            found_by = self._paying(found_by, times)
+            found_by = self._paying(found_by, times, report)
             if found_by != BOTH:
                 chosen = alone
             else:
@@ -406,19 +406,26 @@ class Pilot:
             _noisier(variance, of_alone, faint, wanted),
         )
 
-    def _paying(self, found_by: str, times: float) -> str:
-        """Return what is to find light, if one way alone needs so many times the samples."""
+    def _paying(self, found_by: str, times: float, report: Report) -> str:
+        """Return what is to find light, if one way alone needs so many times the samples.
+
+        The pilot is drawn already: what is left of the run must save as much as is wanted of all.
+        """
         rays = self._rays[found_by] / self._rays[BOTH]
+        most, left = self.sampler.settings.max_spp, report.forecast
+        if most is not None:
+            left = min(left, most * report.jnd.size - report.samples)
+        share = left / (report.samples + left)
         self._measured(
             light_considered=found_by,
             times_the_samples=times if math.isfinite(times) else None,
             rays_of_those_of_both=rays,
         )
-        if times * rays <= WORTH_ALONE:
+        if (1.0 - times * rays) * share >= 1.0 - WORTH_ALONE:
             return found_by
         self._keep(
             f"{WORDS[BOTH]}: {WORDS[found_by]} alone would need {times:.2g} times the samples, of "
-            f"{rays:.0%} of the rays"
+            f"{rays:.0%} of the rays, in the {share:.0%} of the run that is left"
         )
         return BOTH
 
