@@ -46,7 +46,7 @@ OWN = {
 ASK_TOO_MUCH = ("plane", "open", "dim_room")
 
 # Sides of pictures whose difference is looked at and of whole runs, samples, rounds; with --quick.
-FULL = {"side": 96, "run": 512, "count": 96, "rounds": 3, "runs": 1, "most": 32}
+FULL = {"side": 96, "run": 512, "count": 96, "rounds": 5, "runs": 3, "most": 32}
 QUICK = {"side": 16, "run": 24, "count": 16, "rounds": 1, "runs": 1, "most": 16}
 
 # What is wanted: times as fast, times as slow, and the share of the tolerance that is missing.
@@ -306,7 +306,7 @@ def draw_times(axes: Any, names: Sequence[str], times: Sequence[float]) -> None:
 
 def plot(result: dict[str, Any], path: Path) -> None:
     """Draw what each effect saves against what leaving it out shows, and what auto saves."""
-    figure = record.blank_figure(9.0, 4.4)
+    figure = record.blank_figure(9.0, 4.8)
     left, right = figure.subplots(1, 2)
     found = result["scenes"]
     for number, (name, of) in enumerate(found.items()):
@@ -323,7 +323,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
     left.set_xlabel("time of a sample without it, of all")
     left.set_ylabel("largest difference it makes, JND")
     left.set_title("Media, or paths over 2, 3, 4, ... segments left out", fontsize=10)
-    left.legend(fontsize=6, frameon=False)
+    figure.legend(loc="outside lower center", ncols=5, fontsize=7, frameon=False)
     draw_times(right, [OWN.get(name, name) for name in found], list(map(_times, found.values())))
     right.set_title(f"Whole runs, {result['tolerance']:g} JND", fontsize=10)
     for axes in (left, right):
