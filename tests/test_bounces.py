@@ -135,6 +135,12 @@ def test_the_mean_is_that_of_mitsubas_own_image(mitsuba: Any, of: Any, found_by:
     np.testing.assert_allclose(alone.mean(1)[~known], image[~known], rtol=1e-5)
 
 
+def white_plane(mitsuba: Any, **lights: Any) -> Any:
+    """Return the scene of a plane that scatters all light, seen from above."""
+    white = ground(mitsuba, diffuse(1, 1, 1))
+    return scene(mitsuba, 2, [0, 3, 0.1], [0, 0, 0], ground=white, **lights)
+
+
 def squares(light: NDArray[np.float32]) -> NDArray[np.float64]:
     of: NDArray[np.float64] = (light.astype(np.float64) ** 2).sum(1)
     return of
@@ -143,14 +149,7 @@ def squares(light: NDArray[np.float32]) -> NDArray[np.float64]:
 def test_moments_on_a_plane_under_an_even_sky(mitsuba: Any) -> None:
     # By what a white material scatters every sample is 1; by rays aimed over the whole sphere it
     # is 4 cos in the upper half: second moments of 1 and 8 / 3, in each of three channels.
-    of = scene(
-        mitsuba,
-        2,
-        [0, 3, 0.1],
-        [0, 0, 0],
-        ground=ground(mitsuba, diffuse(1, 1, 1)),
-        sky={"type": "constant"},
-    )
+    of = white_plane(mitsuba, sky={"type": "constant"})
     count = 512
     for found_by, moment in ((MATERIALS, 3.0), (LIGHTS, 8.0)):
         found = told(of, count, None, found_by)
@@ -166,19 +165,13 @@ def test_moments_on_a_plane_under_an_even_sky(mitsuba: Any) -> None:
 def test_moments_know_of_a_light_that_was_not_met(mitsuba: Any) -> None:
     # A lamp that one of a million rays of a material would meet: in a few of them the light is
     # missing, and so is its noise; not in what the aimed rays tell.
-    of = scene(
-        mitsuba,
-        2,
-        [0, 3, 0.1],
-        [0, 0, 0],
-        ground=ground(mitsuba, diffuse(1, 1, 1)),
-        lamp={
-            "type": "sphere",
-            "center": [0, 30, 0],
-            "radius": 0.02,
-            "emitter": {"type": "area", "radiance": 1e6},
-        },
-    )
+    lamp = {
+        "type": "sphere",
+        "center": [0, 30, 0],
+        "radius": 0.02,
+        "emitter": {"type": "area", "radiance": 1e6},
+    }
+    of = white_plane(mitsuba, lamp=lamp)
     found = told(of, 16, None, MATERIALS)
     assert squares(found.alone).max() == 0.0
     assert found.excess[MATERIALS].mean() > 1e4 * squares(found.within).mean()
@@ -187,14 +180,7 @@ def test_moments_know_of_a_light_that_was_not_met(mitsuba: Any) -> None:
 def test_rays_are_counted(mitsuba: Any) -> None:
     # Of a plane under the sky: one from the eye, one aimed at the sky, one scattered, which is of
     # no use where light is found by aim.
-    of = scene(
-        mitsuba,
-        2,
-        [0, 3, 0.1],
-        [0, 0, 0],
-        ground=ground(mitsuba, diffuse(1, 1, 1)),
-        sky={"type": "constant"},
-    )
+    of = white_plane(mitsuba, sky={"type": "constant"})
     found = told(of, 4, None, BOTH)
     np.testing.assert_array_equal(found.rays, found.rays_within[BOTH])
     for found_by, rays in ((BOTH, 3), (LIGHTS, 2), (MATERIALS, 2)):

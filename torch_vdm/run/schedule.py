@@ -84,8 +84,7 @@ class Schedule(Steps):
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return what a step returns, using its compiled form where that pays."""
         first = _first(arguments)
-        # A side that becomes 1 would need another form.
-        if not self.compiled or first.numel() < SMALLEST or first.shape[-2] < 3:
+        if not self._compiles(first):
             return function(*arguments)
         items = first.shape[0]
         if not self.stacked or items == 1:
@@ -95,10 +94,15 @@ class Schedule(Steps):
     def valid(self, function: Callable[..., Any], around: Tensor, *arguments: Any) -> Any:
         """Return what a step returns of planes that come with their neighbours."""
         items = around.shape[0]
-        if not self.compiled or not self.stacked or items == 1 or around.numel() < SMALLEST:
+        if not self._compiles(around) or not self.stacked or items == 1:
             return self(function, around, *arguments)
         found = compiled(function)(*below((around, *arguments), items))
         return apart(found, items, rows_lost(around, found, items))
+
+    def _compiles(self, first: Tensor) -> bool:
+        """Return whether a step with this first plane is compiled."""
+        # A side that becomes 1 would need another form.
+        return self.compiled and first.numel() >= SMALLEST and first.shape[-2] > 2
 
     def part(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return what several steps return; compiled graphs choose by themselves what they keep."""
@@ -165,7 +169,7 @@ def chosen(job: Job) -> Schedule:
         stacked=compiles and job.items > 1 and job.stackable,
         compiled=compiles,
         again=again,
-        # For sides that are symbols it is not known where nodes lie in a row.
+        # For sides that are symbols it is not known where nodes lie in a column.
         few=0 if job.traced else FEW_NODES,
     )
 

@@ -20,6 +20,7 @@ from torch import Tensor
 from triton import language as tl
 
 from torch_vdm.model import contrast, csf, distance, pooling
+from torch_vdm.model.level import OF_LUMINANCE
 
 # Where each number begins in what `numbers_of` returns.
 PASSED = tl.constexpr(0)
@@ -57,25 +58,8 @@ PLANES = (
 
 LN2 = tl.constexpr(math.log(2.0))
 
-# The constants from DARK_CONES on.
-CONSTANTS = (
-    "dark_cones",
-    "luminance_of_cones",
-    "dark_light",
-    "dim_luminance",
-    "glare_luminance",
-    "peak_luminance",
-    "peak_frequency",
-    "peak_exponent",
-    "achromatic_gain",
-    "achromatic_dimming",
-    "glare_exponent",
-    "chromatic_dimming",
-    "band_width",
-    "band_floor",
-    "opponents",
-    "transducer_exponent",
-)
+# The constants from DARK_CONES on, those of `OF_LUMINANCE` in its order.
+CONSTANTS = ("dark_cones", *OF_LUMINANCE, "opponents", "transducer_exponent")
 
 
 def numbers_of(levels: Iterable[Tensor], constants: Mapping[str, Tensor]) -> Tensor:
