@@ -1,8 +1,9 @@
 """How many operations a map and a training step are: what a GPU waits for Python.
 
 Counted on the processor, with the schedule that a GPU gets: every operation that PyTorch
-dispatches, but for views, which start no kernel; and every launch of a kernel of Triton, which is
-not run. No time is measured.
+dispatches, but for views, which start no kernel; every launch of a kernel of Triton, which is not
+run; and, of compiled code, every kernel that is left after fusion, by the rules for a processor. No
+time is measured.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,11 +23,12 @@ from benchmarks.record import caption, circumstances, save
 from benchmarks.rungs import RUNGS
 from benchmarks.speed import BATCH, FULL_HD, PATCH, ssim, ssim_loss
 from torch_vdm import VDM, VDMLoss
-from torch_vdm.run import kernel
+from torch_vdm.run import kernels
 from torch_vdm.run.schedule import Job, Schedule, chosen
 
 # What is wanted of the default metric: a map, and a loss with its gradient.
 WANTED = {"map": 250, "loss": 400}
+WANTED_COMPILED = {"map": 60, "loss": 120}
 
 # Without a kernel, beside what PyTorch marks as a view.
 NO_KERNEL = ("empty", "empty_like", "new_empty", "empty_strided", "detach", "lift_fresh")
@@ -40,6 +42,11 @@ class Counter(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]  # torch's own
         self.count = 0
+
+    @classmethod
+    def ignore_compile_internals(cls) -> bool:
+        """Return that compiled code runs compiled, and is counted by `compiled_kernels`."""
+        return True
 
     def __torch_dispatch__(  # noqa: D105  # torch's own
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
@@ -65,37 +72,92 @@ def run(quick: bool, output: Path | None) -> None:
         maps[f"{name}, a processor's"] = VDM(**options)
         losses[name] = VDMLoss(**options, schedule=of_a_gpu(True))
         losses[f"{name}, a processor's"] = VDMLoss(**options)
-        if name == "fast" and find_spec("triton"):
-            maps["fast, kernel"] = VDM(**options, schedule=of_a_gpu(False, kernel=True))
-            losses["fast, kernel"] = VDMLoss(**options, schedule=of_a_gpu(True, kernel=True))
-    with _launched() if find_spec("triton") else nullcontext():
+        if name == "fast":
+            for more, how in _others().items():
+                maps[f"fast, {more}"] = VDM(**options, schedule=of_a_gpu(False, **how))
+                losses[f"fast, {more}"] = VDMLoss(**options, schedule=of_a_gpu(True, **how))
+    with _launched() if find_spec("triton") else nullcontext(), compiled_kernels() as kernels_run:
         with torch.no_grad():
-            result["map"] = {name: count(function, *pair) for name, function in maps.items()}
-        result["loss"] = {name: count(step(loss), *batch) for name, loss in losses.items()}
-    result["wanted"] = WANTED
+            result["map"] = {name: count(each, kernels_run, *pair) for name, each in maps.items()}
+        result["loss"] = {
+            name: count(step(loss), kernels_run, *batch) for name, loss in losses.items()
+        }
+    result["wanted"], result["wanted_compiled"] = WANTED, WANTED_COMPILED
     table = _table(result)
     print(table)
     if output is not None:
         save(output, "launches", result, table)
 
 
-def count(function: Contender, test: Tensor, reference: Tensor) -> int:
-    """Return how many operations a function of two images is, once what it keeps is there."""
+def _others() -> dict[str, dict[str, bool]]:
+    """Return by name how the default metric is computed besides."""
+    found = {"compiled": {"compiled": True}}
+    if find_spec("triton"):
+        found["kernel"] = {"kernel": True}
+        found["compiled, kernel"] = {"compiled": True, "kernel": True}
+    return found
+
+
+def count(function: Contender, kernels_run: list[int], test: Tensor, reference: Tensor) -> int:
+    """Return how many operations a function of two images is, once what it keeps is there.
+
+    ``kernels_run``: of `compiled_kernels`.
+    """
     function(test, reference)
+    function(test, reference)
+    kernels_run.clear()
     with Counter() as counter:
         function(test, reference)
-    return int(counter.count)
+    return int(counter.count) + sum(kernels_run)
 
 
-def of_a_gpu(gradients: bool, kernel: bool = False) -> Schedule:
-    """Return the schedule that a GPU gets, and with the kernel if asked for."""
+@contextmanager
+def compiled_kernels() -> Iterator[list[int]]:
+    """Yield a list to which every call of a compiled graph adds how many kernels it has.
+
+    The graph must have been compiled within. torch has no public way to tell.
+    """
+    from torch._functorch import config as autograd
+    from torch._inductor import config as inductor
+    from torch._inductor.output_code import CompiledFxGraph
+    from torch._inductor.scheduler import NopKernelSchedulerNode
+    from torch._inductor.virtualized import V
+
+    found: list[int] = []
+    made, called = CompiledFxGraph.__init__, CompiledFxGraph.__call__
+
+    def fused(nodes: list[Any]) -> list[Any]:
+        graph: Any = V.graph
+        graph.kernels = sum(not isinstance(node, NopKernelSchedulerNode) for node in nodes)
+        return nodes
+
+    def init(self: Any, code: Any, graph: Any, *others: Any, **options: Any) -> None:
+        made(self, code, graph, *others, **options)
+        self.kernels = graph.kernels
+
+    def call(self: Any, inputs: Any) -> Any:
+        found.append(self.kernels)
+        return called(self, inputs)
+
+    with (
+        # What was compiled before would be without its number.
+        inductor.patch({"_post_fusion_custom_pass": fused, "fx_graph_cache": False}),
+        autograd.patch({"enable_autograd_cache": False}),
+        patch.object(CompiledFxGraph, "__init__", init),
+        patch.object(CompiledFxGraph, "__call__", call),
+    ):
+        yield found
+
+
+def of_a_gpu(gradients: bool, kernel: bool = False, compiled: bool = False) -> Schedule:
+    """Return the schedule that a GPU gets, and with the kernels if asked for."""
     job = Job(
         items=1,
         size=FULL_HD,
         stackable=True,
         gradients=gradients,
         one_sided=gradients,  # of a loss, by its test alone
-        compiles=False,
+        compiles=compiled,
         checkpoints=False,
         accelerated=True,
         traced=False,
@@ -113,12 +175,20 @@ class _OneOperation:
 @contextmanager
 def _launched() -> Iterator[None]:
     """Let the kernel be launched where there is no GPU."""
-    from torch_vdm.run import triton_level
+    from torch_vdm.run.kernels import triton_level
 
-    names = ("local_difference", "slopes", "gradients")
-    kernels = SimpleNamespace(numbers_of=triton_level.numbers_of)
-    vars(kernels).update((name, _OneOperation()) for name in names)
-    with patch.object(kernel, "kernels_on", lambda _: kernels):
+    names = (
+        "local_difference",
+        "slopes",
+        "gradients",
+        "analysis",
+        "synthesis",
+        "descent",
+        "ascent",
+    )
+    fake = SimpleNamespace(numbers_of=triton_level.numbers_of)
+    vars(fake).update((name, _OneOperation()) for name in names)
+    with patch.object(kernels, "of", lambda *_: fake):
         yield
 
 
@@ -142,6 +212,7 @@ def _table(result: dict[str, Any]) -> str:
     lines += [
         f"| {name} | {result['map'][name]:,} | {result['loss'][name]:,} |" for name in result["map"]
     ]
-    wanted = result["wanted"]
-    lines += [f"| wanted of fast | {wanted['map']} | {wanted['loss']} |", "", caption(result), ""]
+    for name, wanted in (("eager", result["wanted"]), ("compiled", result["wanted_compiled"])):
+        lines += [f"| wanted of fast, {name} | {wanted['map']} | {wanted['loss']} |"]
+    lines += ["", caption(result), ""]
     return "\n".join(lines)

@@ -1,11 +1,13 @@
-"""The gradient that is worked out by hand, against autograd's."""
+"""Gradients that are worked out by hand, against autograd's."""
 
 import pytest
 import torch
 from torch import Tensor
 
 from torch_vdm import VDM, Display, Effects, VDMLoss
+from torch_vdm.model.display import linear_values
 from torch_vdm.run import schedule, whole
+from torch_vdm.run.gradients.light import linear_by_hand
 
 # Images here are numbers that need be no pictures.
 pytestmark = pytest.mark.filterwarnings("ignore:expected sRGB-coded values:UserWarning")
@@ -16,6 +18,11 @@ def level_by_level(monkeypatch: pytest.MonkeyPatch) -> None:
     # As a large image is: small levels are autograd's.
     monkeypatch.setattr(schedule, "FEW_NODES", 1)
     monkeypatch.setattr(schedule, "LARGEST_AT_ONCE", 500)
+
+
+def leave_to_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (whole, schedule):
+        monkeypatch.setattr(module, "by_hand", lambda: False)
 
 
 def gradients(
@@ -44,7 +51,7 @@ def test_is_autograds(
     size: tuple[int, int], wanted: tuple[bool, bool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ours = gradients(VDM(), noise(size), wanted)
-    monkeypatch.setattr(whole, "by_hand", lambda: False)
+    leave_to_autograd(monkeypatch)
     for mine, theirs in zip(ours, gradients(VDM(), noise(size), wanted), strict=True):
         # Of the largest: a slope may be what two that are millions of times as large leave.
         largest = 0.0 if theirs is None else float(theirs.abs().max())
@@ -64,7 +71,7 @@ def test_is_autograds(
 def test_is_autograds_for_every_option(metric: VDM, monkeypatch: pytest.MonkeyPatch) -> None:
     # HDR, with values below 0.
     ours = gradients(metric, noise((12, 9), 30.0), (True, True))
-    monkeypatch.setattr(whole, "by_hand", lambda: False)
+    leave_to_autograd(monkeypatch)
     for mine, theirs in zip(
         ours, gradients(metric, noise((12, 9), 30.0), (True, True)), strict=True
     ):
@@ -84,7 +91,7 @@ def test_is_autograds_for_one_plane_of_grey(monkeypatch: pytest.MonkeyPatch) -> 
         return [leaf.grad for leaf in leaves if leaf.grad is not None]
 
     ours, of_three = slopes(True), slopes(False)
-    monkeypatch.setattr(whole, "by_hand", lambda: False)
+    leave_to_autograd(monkeypatch)
     theirs = slopes(True)
     assert len(ours) == len(theirs) == len(of_three) == 2
     for mine, other, three in zip(ours, theirs, of_three, strict=True):
@@ -95,14 +102,35 @@ def test_is_autograds_for_one_plane_of_grey(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_is_of_use_on_the_default_route() -> None:
     # Else the others would compare autograd with itself.
-    test, reference = noise((33, 20))
+    test, reference = noise((64, 64))
     graph = VDM().power(test.requires_grad_(), reference).grad_fn
     seen, left = set(), [graph]
     while left:
         if (node := left.pop()) is not None and node not in seen:
             seen.add(node)
             left += [each for each, _ in node.next_functions]
-    assert "_LocalDifferenceBackward" in {node.name() for node in seen}
+    names = {node.name() for node in seen}
+    steps = ("_LocalDifference", "_Analysis", "_AnalysisAtBorder", "_LinearValues", "_Mixed")
+    assert {f"{step}Backward" for step in (*steps, "_PassedDown")} <= names
+
+
+@pytest.mark.parametrize(
+    "display",
+    [Display.srgb(), Display.srgb(1e5), Display.linear(), Display.linear(1e11), Display.xyz()],
+    ids=str,
+)
+def test_slope_of_linear_values_is_autograds_within_limits_and_0_beyond(display: Display) -> None:
+    values = [-2e13, -2e4, -1.0, 0.0, 0.04, 0.041, 0.5, 1.0, 3.0, 9e3, 2e4, 2e13]
+    image = torch.tensor(values, dtype=torch.float64).view(1, 3, 2, 2)
+    weights = torch.linspace(0.5, 2.0, len(values), dtype=torch.float64).view_as(image)
+    around = display.encoding, display.limit(image)
+    slopes: list[Tensor] = []
+    for function in (linear_values, linear_by_hand):
+        leaf = image.clone().requires_grad_()
+        slopes += torch.autograd.grad((function(leaf, *around) * weights).sum(), leaf)
+    torch.testing.assert_close(slopes[1], slopes[0], rtol=1e-12, atol=0.0)
+    assert slopes[0].flatten()[0] == slopes[0].flatten()[-1] == 0.0
+    assert torch.count_nonzero(slopes[0]) >= 3
 
 
 @pytest.mark.parametrize("name", ["transducer_exponent", "summation_exponent", "opponents"])

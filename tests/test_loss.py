@@ -11,7 +11,7 @@ from torch import Tensor
 from torch_vdm import VDM, Display, Haar, Observer, StationaryHaar, Steerable, VDMLoss
 from torch_vdm.loss import DARK_LIGHT
 from torch_vdm.model.cortex import Transform
-from torch_vdm.run.backward import by_hand
+from torch_vdm.run.gradients import by_hand
 
 
 def images(batch: int = 3) -> tuple[Tensor, Tensor]:
@@ -171,7 +171,9 @@ def test_a_checkpoint_changes_no_gradient(
     for checkpoint in (False, True):
         loss = VDMLoss(transform=transform, checkpoint=checkpoint)
         # Against what autograd keeps: where the gradient is worked out by hand, that is less.
-        monkeypatch.setattr("torch_vdm.run.whole.by_hand", by_hand if checkpoint else lambda: False)
+        for module in ("whole", "schedule"):
+            now = by_hand if checkpoint else lambda: False
+            monkeypatch.setattr(f"torch_vdm.run.{module}.by_hand", now)
         kept.append({})
         with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
             value = loss(test, reference)

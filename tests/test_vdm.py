@@ -298,7 +298,7 @@ def test_effects_that_are_off_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> N
         "model.level.surround",
         "model.level.unmasked",
         "model.level.masking_energy",
-        "run.backward.surround",
+        "run.gradients.level.surround",
     ):
         monkeypatch.setattr(f"torch_vdm.{name}", forbidden)
     VDM(effects=Effects(False, False, False, False))(*images())

@@ -130,7 +130,8 @@ class VDMLoss(operators.Enrolled):
 
     def _in_rows(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return `_absolute`, a few rows at a time on every route."""
-        schedule = chosen(self.metric._job(test, reference)._replace(compiles=False))
+        job = self.metric._job(test, reference)._replace(compiles=False)
+        schedule = self.metric.schedule or chosen(job)
         return schedule.pixels(self._absolute, test, reference)
 
     def _absolute(self, test: Tensor, reference: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ from torch_vdm.options import choice
 from torch_vdm.pair import Nonfinite, Numbers, PairMetric
 from torch_vdm.plan import Plan, everything, is_grey, plan_of
 from torch_vdm.precision import computed_in
-from torch_vdm.run import kernel, regions, strips, whole
+from torch_vdm.run import kernels, regions, strips, whole
 from torch_vdm.run.schedule import Schedule, chosen
 from torch_vdm.run.tiles import Done, Progress, in_tiles
 from torch_vdm.run.tiling import TILE, Source, check_sources, read
@@ -118,7 +118,7 @@ class VDM(PairMetric):
                 "items lie below one another with Haar() alone"
             )
         if schedule is not None and schedule.kernel:
-            kernel.require(schedule, self.observer, self.transform, self.effects)
+            kernels.require(self.observer, self.transform, self.effects)
         self.schedule = schedule
 
         peaks = [self.transform.peaks(level) for level in range(DEEPEST)]
@@ -167,7 +167,7 @@ class VDM(PairMetric):
     def model(self, dtype: torch.dtype, steps: Steps | None = None, grey: bool = False) -> Model:
         """Return the model with constants of a precision; see `torch_vdm.model.model`."""
         constants = self._constants(dtype)
-        known = self._levels[dtype] if self._has_own_constants() else None
+        derived = self._derived[dtype] if self._has_own_constants() else None
         return Model(
             self.display,
             self.observer,
@@ -177,16 +177,16 @@ class VDM(PairMetric):
             self._schedule if steps is None else steps,
             grey,
             self.observer.summation_exponent == CUBES and self._is_own("summation_exponent"),
-            known,
+            derived,
         )
 
     def _place(self, device: torch.device) -> None:
-        """Make the constants on a device, and what all levels respond to."""
+        """Make the constants on a device, and what follows from them."""
         super()._place(device)
         options = self.display, self.observer, self.transform, self.effects
         with torch.no_grad(), torch.inference_mode(False):
-            self._levels = {
-                dtype: Model(*options, constants).all_levels()
+            self._derived = {
+                dtype: Model(*options, constants).derive()
                 for dtype, constants in self._cast.items()
             }
 

@@ -2,6 +2,7 @@
 
 from torch import Tensor
 
+from torch_vdm.model.display import linear_values
 from torch_vdm.model.matrix import mix
 
 # Rows S, M, L; columns X, Y, Z. Unit: cone response per cd/m2. Source: Eq. 1 of Bolin and Meyer
@@ -38,3 +39,11 @@ def cone_responses(xyz: Tensor, matrix: Tensor) -> Tensor:
         (B, 3, H, W); channels S, M, L.
     """
     return mix(matrix, xyz)
+
+
+def pixels_to_cones(image: Tensor, encoding: str, limit: Tensor | None, matrix: Tensor) -> Tensor:
+    """Return the cone responses (B, 3, H, W) to an image; ``matrix`` applies to linear values.
+
+    ``encoding`` and ``limit`` are those of `linear_values`.
+    """
+    return cone_responses(linear_values(image, encoding, limit), matrix)

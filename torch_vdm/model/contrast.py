@@ -2,6 +2,7 @@
 
 from torch import Tensor
 
+from torch_vdm.model.limit import within
 from torch_vdm.model.matrix import mix
 
 # Rows A, C1, C2; columns S, M, L. Unit: opponent contrast per cone contrast. Source: Eq. 3 of
@@ -43,7 +44,7 @@ def local_contrast(details: Tensor, scale: Tensor) -> Tensor:
     Tensor
         (B, 3, orientations, h, w), dimensionless cone contrast.
     """
-    return (details * scale.unsqueeze(2)).clamp(-LARGEST, LARGEST)
+    return within(details * scale.unsqueeze(2), LARGEST)
 
 
 def weber_contrast(first: Tensor, second: Tensor, dark_light: Tensor) -> Tensor:
@@ -52,7 +53,7 @@ def weber_contrast(first: Tensor, second: Tensor, dark_light: Tensor) -> Tensor:
     It is antisymmetric, and at most 2 for non-negative light.
     """
     mean = 0.5 * (adapted(first, dark_light) + adapted(second, dark_light))
-    return ((first - second) / mean).clamp(-LARGEST, LARGEST)
+    return within((first - second) / mean, LARGEST)
 
 
 def opponents(contrast: Tensor, matrix: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from typing import Literal, Self, get_args
 import torch
 from torch import Tensor
 
+from torch_vdm.model.limit import within
 from torch_vdm.model.matrix import mix
 from torch_vdm.options import choice, number
 
@@ -128,10 +129,10 @@ class Display:
         0.01 is about as visible on black as on white.
         """
         if self.encoding == "srgb":
-            return image.clamp(-LARGEST_CODE, LARGEST_CODE)
+            return within(image, LARGEST_CODE)
         white = XYZ_WHITE if self.encoding == "xyz" else self.white
         light = image * (self.gain / white)
-        return encode_srgb(light.clamp(-BRIGHTEST, BRIGHTEST))
+        return encode_srgb(within(light, BRIGHTEST))
 
 
 def linear_values(image: Tensor, encoding: str, limit: Tensor | None) -> Tensor:

@@ -1,7 +1,7 @@
 """Distance summation, the last box of Fig. 2: Quick's vector sum over channels and levels."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -82,11 +82,28 @@ class Paths(NamedTuple):
     """(B, 1, 1, 1), the value that every path starts from."""
 
 
+def passed_down(nodes: Tensor, total: Tensor, charge: Charge | None, before: Before) -> Tensor:
+    """Return what has accumulated at the nodes of a level, (B, 1, h, w): a step of `accumulate`.
+
+    ``nodes`` are their local differences; ``total`` is what has accumulated at their parents.
+    """
+    parents = push(total, (nodes.shape[-2], nodes.shape[-1]), before)
+    if charge is None:
+        return nodes + parents
+    own = nodes if charge.own is None else nodes * charge.own
+    return torch.addcmul(own, parents, charge.inherited)
+
+
+# `passed_down`, or what gives the same.
+Step = Callable[[Tensor, Tensor, Charge | None, Before], Tensor]
+
+
 def accumulate(
     local: Sequence[Tensor],
     root: Tensor,
     before: Sequence[Before] = (),
     charges: Sequence[Charge] | None = None,
+    down: Step = passed_down,
 ) -> Tensor:
     """Sum the local differences down every path of the quad-tree.
 
@@ -100,6 +117,8 @@ def accumulate(
         For each level, how many nodes are put before its first; none by default.
     charges
         One per level: what its nodes are charged. None: all that their parent has, as printed.
+    down
+        What computes `passed_down`.
 
     Returns
     -------
@@ -108,12 +127,7 @@ def accumulate(
     """
     total = root
     for level, (nodes, first) in enumerate(zip(local, before or [NONE] * len(local), strict=True)):
-        total = push(total, (nodes.shape[-2], nodes.shape[-1]), first)
-        if charges is None:
-            total = nodes + total
-            continue
-        inherited, own = charges[level]
-        total = torch.addcmul(nodes if own is None else nodes * own, total, inherited)
+        total = down(nodes, total, None if charges is None else charges[level], first)
     return total
 
 

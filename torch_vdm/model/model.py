@@ -9,6 +9,7 @@ charged to the pixels that caused them (`Model.charges`).
 """
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from torch_vdm.effects import Effects
 from torch_vdm.model import filtering
 from torch_vdm.model.aberration import attenuation
 from torch_vdm.model.charging import Charge, changes, charge
-from torch_vdm.model.cones import cone_responses, of_grey
+from torch_vdm.model.cones import of_grey, pixels_to_cones
 from torch_vdm.model.contrast import opponents, weber_contrast
 from torch_vdm.model.cortex import Cortex, Transform
 from torch_vdm.model.cortex.haar import lowpass_of_light
@@ -47,6 +48,15 @@ from torch_vdm.observer import Observer
 FILTER = ("gain", "cutoff", "order")
 
 
+class Derived(NamedTuple):
+    """What follows from the constants of a model alone."""
+
+    levels: Levels
+    """What all levels respond to, the coarsest first."""
+    to_cones: Tensor
+    """(3, 3), from linear values to cones."""
+
+
 class Model:
     """What is computed from two images: the boxes of Fig. 2, with all that they depend on.
 
@@ -63,8 +73,8 @@ class Model:
         Results change by rounding only.
     cubes
         Whether the summation exponent is 6, and needs no gradient.
-    every_level
-        `all_levels`, where that is known.
+    derived
+        What `derive` gives, where that is known.
     """
 
     def __init__(
@@ -77,7 +87,7 @@ class Model:
         steps: Steps = PLAIN,
         grey: bool = False,
         cubes: bool = False,
-        every_level: Levels | None = None,
+        derived: Derived | None = None,
     ) -> None:
         self.display = display
         self.observer = observer
@@ -86,7 +96,7 @@ class Model:
         self.constants = constants
         self.steps = steps
         self.cubes = cubes
-        self.every_level = every_level
+        self.derived = derived
         self.grey = self._of_grey() if grey else None
 
     # One image.
@@ -104,10 +114,14 @@ class Model:
             one = image.mean(1, keepdim=True) if image.requires_grad else image[:, :1]
             return self.steps.pixels(lambda part: self.steps(linear_values, part, *around), one)
         matrix = self._to_cones()
-        return self.steps.pixels(lambda part: self.steps(_light, part, *around, matrix), image)
+        return self.steps.pixels(
+            lambda part: self.steps(pixels_to_cones, part, *around, matrix), image
+        )
 
     def _to_cones(self) -> Tensor:
         """Return the matrix from linear values to cones, so that pixels are mixed only once."""
+        if self.derived is not None:
+            return self.derived.to_cones
         matrix = self.constants["cones"]
         if self.display.encoding == "xyz":
             return matrix
@@ -280,6 +294,12 @@ class Model:
         grid = self.grid(size) if grid is None else grid
         return push(plane, size, before=grid.before(0)).contiguous()
 
+    # What follows from the constants.
+
+    def derive(self) -> Derived:
+        """Return what follows from the constants alone."""
+        return Derived(self.all_levels(), self._to_cones())
+
     # What a level depends on.
 
     def options(self) -> Options:
@@ -319,9 +339,10 @@ class Model:
     def levels(self, finest: int, count: int) -> Levels:
         """Return what ``count`` levels respond to, the coarsest first; the finest is ``finest``."""
         coarsest = finest + count
-        if self.every_level is None:
+        if self.derived is None:
             return self.all_levels(slice(finest, coarsest))
-        return Levels(*(part[DEEPEST - coarsest : DEEPEST - finest] for part in self.every_level))
+        some = slice(DEEPEST - coarsest, DEEPEST - finest)
+        return Levels(*(part[some] for part in self.derived.levels))
 
     def all_levels(self, some: slice = slice(None)) -> Levels:
         """Return what all levels respond to, or some from the finest; the coarsest first.
@@ -360,11 +381,6 @@ class Model:
 def weights_alone(level: Level) -> Sight:
     """Return the channel weighting of a level of filtered images: details are contrasts already."""
     return Sight(None, (1.0 / level.gain).unsqueeze(0))
-
-
-def _light(image: Tensor, encoding: str, limit: Tensor | None, matrix: Tensor) -> Tensor:
-    """Return the cone responses (B, 3, H, W) to an image; ``matrix`` applies to linear values."""
-    return cone_responses(linear_values(image, encoding, limit), matrix)
 
 
 def _size(plane: Tensor) -> tuple[int, int]:

@@ -47,29 +47,26 @@ class Column(NamedTuple):
 class Cells(NamedTuple):
     """Where levels lie on one plane, with their borders repeated around them."""
 
-    sizes: Sizes
-    corners: tuple[tuple[int, int], ...]
-    """Row and column of the first node of each level's ring; without rings, of its first node."""
     nodes: Tensor
     """(h, w): which place of the column lies where; between the levels, any."""
+    places: Tensor
+    """(N, 1): where the nodes of the column lie on a plane that has lost the levels' rings."""
 
     def of(self, column: Tensor) -> Tensor:
         """Return the plane (..., h, w) of a column."""
         return at(column, self.nodes)
 
-    def planes(self, valid: Tensor) -> list[Tensor]:
-        """Return the levels (..., h, w) of a plane that has lost the levels' rings."""
-        return [
-            valid[..., y : y + height, x : x + width]
-            for (y, x), (height, width) in zip(self.corners, self.sizes, strict=True)
-        ]
+    def column(self, valid: Tensor) -> Tensor:
+        """Return the column of a plane (..., h, w) that has lost the levels' rings."""
+        # All at once: the gradient of a slice for each level is a plane for each of them.
+        return at(valid, self.places)
 
 
-def at(column: Tensor, places: Tensor) -> Tensor:
-    """Return the values (..., h, w) of a column at places (h, w)."""
+def at(plane: Tensor, places: Tensor) -> Tensor:
+    """Return the values (..., h, w) of a column, or of a plane row by row, at places (h, w)."""
     # Selecting from two dimensions is much faster than from more.
-    found = column.flatten(-2).flatten(0, -2).index_select(1, places.flatten())
-    return unviewed(found, (*column.shape[:-2], *places.shape))
+    found = plane.flatten(-2).flatten(0, -2).index_select(1, places.flatten())
+    return unviewed(found, (*plane.shape[:-2], *places.shape))
 
 
 def column_of(
@@ -123,7 +120,9 @@ def _cells(sizes: Sizes, ring: tuple[int, int], device: torch.device) -> Cells:
     around = sum(ring)
     sides = [(height + around, width + around) for height, width in sizes]
     corners = min((_beside(sides), _below(sides), _in_two(sides)), key=lambda c: _area(sides, c))
-    nodes = np.zeros(_extent(sides, corners), np.int64)
+    rows_and_columns = _extent(sides, corners)
+    nodes = np.zeros(rows_and_columns, np.int64)
+    places: list[NDArray[np.int64]] = []
     start = 0
     for (height, width), (y, x) in zip(sizes, corners, strict=True):
         rows, columns = (
@@ -131,8 +130,13 @@ def _cells(sizes: Sizes, ring: tuple[int, int], device: torch.device) -> Cells:
         )
         inside = start + rows[:, None] * width + columns
         nodes[y : y + height + around, x : x + width + around] = inside
+        across = rows_and_columns[1] - around
+        places.append(
+            ((np.arange(y, y + height) * across)[:, None] + np.arange(x, x + width)).flatten()
+        )
         start += height * width
-    return Cells(sizes, corners, torch.from_numpy(nodes).to(device))
+    found = nodes, np.concatenate(places)[:, None]
+    return Cells(*(torch.from_numpy(each).to(device) for each in found))
 
 
 Corners = tuple[tuple[int, int], ...]

@@ -12,6 +12,9 @@ from torch.utils.checkpoint import checkpoint
 from torch_vdm.model.cortex import bands
 from torch_vdm.model.steps import Steps
 from torch_vdm.run.compiled import SMALLEST, compiled
+from torch_vdm.run.gradients import by_hand, is_plain
+from torch_vdm.run.gradients.steps import STEPS as BY_HAND
+from torch_vdm.run.kernels.steps import STEPS as BY_KERNEL
 from torch_vdm.run.stacked import apart, below, rows_lost, unviewed
 from torch_vdm.run.tiling import Tiling, cut
 
@@ -28,7 +31,7 @@ BAND_STRIP = 2**17
 
 # Levels of at most so many nodes are computed at once: there, calling an operation costs more than
 # its arithmetic. Status: choice, measured.
-FEW_NODES = 64 * 64
+FEW_NODES = 96 * 96
 
 # More nodes than any level has.
 EVERY_LEVEL = 2**62
@@ -74,7 +77,7 @@ class Schedule(Steps):
     few: int = field(default_factory=lambda: FEW_NODES)
     """Levels of at most this many nodes are computed at once."""
     kernel: bool = False
-    """Whether a level's difference is a kernel of Triton; see `torch_vdm.run.kernel`."""
+    """Whether what has kernels of Triton is computed by them; see `torch_vdm.run.kernels`."""
 
     @property
     def fused(self) -> bool:
@@ -84,12 +87,19 @@ class Schedule(Steps):
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return what a step returns, using its compiled form where that pays."""
         first = _first(arguments)
-        if not self._compiles(first):
-            return function(*arguments)
+        by_kernel = self.kernel and function in BY_KERNEL and is_plain()
+        if by_kernel or not self._compiles(first):
+            return self.form(function, first)(*arguments)
         items = first.shape[0]
         if not self.stacked or items == 1:
             return compiled(function)(*arguments)
         return apart(compiled(function)(*below(arguments, items)), items)
+
+    def form(self, function: Callable[..., Any], first: Tensor) -> Callable[..., Any]:
+        """Return what gives the same as a step, uncompiled, if its first plane is ``first``."""
+        if self.kernel and function in BY_KERNEL and is_plain():
+            return BY_KERNEL[function]
+        return BY_HAND.get(function, function) if first.requires_grad and by_hand() else function
 
     def valid(self, function: Callable[..., Any], around: Tensor, *arguments: Any) -> Any:
         """Return what a step returns of planes that come with their neighbours."""

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torch_vdm.model.charging import AROUND, Charge, changes, charge_within
 from torch_vdm.model.cortex import Cortex, Haar
-from torch_vdm.model.distance import Paths, accumulate
+from torch_vdm.model.distance import Paths, accumulate, passed_down
 from torch_vdm.model.grid import Before
 from torch_vdm.model.level import (
     Level,
@@ -21,10 +21,11 @@ from torch_vdm.model.level import (
     summed_across,
 )
 from torch_vdm.model.model import Model, weights_alone
-from torch_vdm.run import kernel
 from torch_vdm.run import schedule as limits
-from torch_vdm.run.backward import by_hand, local_difference_by_hand
 from torch_vdm.run.column import Column, cells_of, column_of
+from torch_vdm.run.gradients import by_hand
+from torch_vdm.run.gradients.level import local_difference_by_hand
+from torch_vdm.run.kernels import level as kernel
 from torch_vdm.run.schedule import Schedule
 
 
@@ -45,7 +46,8 @@ def compared(model: Model, schedule: Schedule, first: Cortex, second: Cortex) ->
 def descended(model: Model, schedule: Schedule, paths: Paths, before: Sequence[Before]) -> Tensor:
     """Return `Model.descended`, computing what the coarsest levels are charged at once."""
     charges = _charges(model, schedule, paths.changes, before) if model.observer.charging else None
-    return accumulate(paths.local, paths.root, before, charges)
+    down = schedule.form(passed_down, paths.root)
+    return accumulate(paths.local, paths.root, before, charges, down)
 
 
 def differences(model: Model, schedule: Schedule, first: Cortex, second: Cortex) -> Paths:
@@ -112,7 +114,7 @@ def level_difference(
         some = slice(cut * at_once, (cut + 1) * at_once)
         arguments = one, other, sight.of(some), other_sight.of(some)
         if known:
-            local.append(local_difference_by_hand(of, *arguments, *fixed))
+            local.append(local_difference_by_hand(of, *arguments, *fixed, options.cubes))
         else:
             local.append(schedule.part(of, *arguments))
     return torch.stack(local).sum(0) if len(local) > 1 else local[0]
@@ -131,7 +133,7 @@ def _of_few(
     difference = _column_difference(model, schedule, (first, second), column, details, level)
     cells = cells_of(column.sizes, options.ring, difference)
     around = summed_across(cells.of(difference), options, schedule)
-    return cells.planes(schedule.valid(pooled_difference, around, options))
+    return column.planes(cells.column(schedule.valid(pooled_difference, around, options)))
 
 
 def _column_difference(
@@ -181,8 +183,8 @@ def _charges(
         cells = cells_of(column.sizes, (AROUND * shifts, AROUND * shifts), changes[0])
         around = cells.of(column.of(changes[:few]))
         inherited, own = charge_within(around, shifts, filtered, schedule.cached)
-        owns = [None] * few if own is None else cells.planes(own)
-        coarse = list(map(Charge, cells.planes(inherited), owns))
+        owns = [None] * few if own is None else column.planes(cells.column(own))
+        coarse = list(map(Charge, column.planes(cells.column(inherited)), owns))
     return coarse + (model.charges(changes[few:]) or [])
 
 

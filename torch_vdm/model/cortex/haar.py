@@ -175,7 +175,7 @@ def levels(
     an image of ``size`` = (H, W) pixels.
     """
     found = _descended(
-        planes, octaves, size, true_means, grid, count, steps, _analyse, analyse_at_border
+        planes, octaves, size, true_means, grid, count, steps, analyse, analyse_at_border
     )
     # Away from the border a window is the node.
     windows = [window[0] if window else lowpass for lowpass, _, *window in found]
@@ -242,12 +242,12 @@ def _descended(
 
 
 def _means(even: Tensor) -> tuple[Tensor]:
-    """Return the lowpass of `_analyse` alone; faster than torch's own average of 2x2."""
+    """Return the lowpass of `analyse` alone; faster than torch's own average of 2x2."""
     sums = (even[..., 0::2, :] + even[..., 1::2, :]).mul_(0.25)
     return (sums[..., 0::2] + sums[..., 1::2],)
 
 
-def _analyse(even: Tensor) -> tuple[Tensor, Tensor]:
+def analyse(even: Tensor) -> tuple[Tensor, Tensor]:
     """Return the lowpass (B, C, h/2, w/2) and the details (B, C, 3, h/2, w/2) of a plane, Eq. 2."""
     top, bottom = even[..., 0::2, :], even[..., 1::2, :]
     sums, differences = (top + bottom).mul_(0.25), (top - bottom).mul_(0.25)

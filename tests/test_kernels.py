@@ -1,4 +1,4 @@
-"""The kernel of a level, run by Triton's interpreter, against the model's own steps."""
+"""Kernels, run by Triton's interpreter, against the model's own steps."""
 
 import dataclasses
 import os
@@ -14,10 +14,15 @@ from torch import Tensor
 
 from benchmarks.places import ROOT
 from torch_vdm import VDM, Effects, Haar, Observer, Steerable, VDMLoss
+from torch_vdm.model.charging import Charge
 from torch_vdm.model.cortex import Cortex
+from torch_vdm.model.distance import passed_down
 from torch_vdm.model.grid import Grid
-from torch_vdm.run import kernel
+from torch_vdm.model.steps import Steps
+from torch_vdm.run import kernels
 from torch_vdm.run import schedule as limits
+from torch_vdm.run.kernels import level as of_a_level
+from torch_vdm.run.kernels.descent import passed_down_by_kernel
 from torch_vdm.run.schedule import Schedule
 
 pytest.importorskip("triton", reason="Triton is not installed")
@@ -36,10 +41,12 @@ def interpreted() -> Iterator[None]:
     # Set while the kernels are made, and only then: other tests compile by Triton.
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TRITON_INTERPRET", "1")
-        from torch_vdm.run import triton_level
+        from torch_vdm.run.kernels import triton_descent, triton_haar, triton_level
+    assert triton_descent.INTERPRETED
+    assert triton_haar.INTERPRETED
     assert triton_level.INTERPRETED
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kernel, "BLOCK", BLOCK)
+        patch.setattr(kernels, "BLOCK", BLOCK)
         yield
 
 
@@ -84,7 +91,7 @@ def of_level(
         )
     level = model.levels(0, 2).only(1)
     if schedule.kernel:
-        local = kernel.local_difference(model, first, second, 1, level)
+        local = of_a_level.local_difference(model, first, second, 1, level)
     else:
         local = model.local_difference(first, second, 1, level)
     if wanted is None:
@@ -129,7 +136,7 @@ def test_a_level_is_the_models(
     dtype: torch.dtype,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(kernel, "BLOCK", LARGE_BLOCK)
+    monkeypatch.setattr(kernels, "BLOCK", LARGE_BLOCK)
     images = level_of("pictures", size, before, batch, dtype)
     (plain,) = of_level(PLAIN, *images)
     (mine,) = of_level(KERNEL, *images)
@@ -171,6 +178,54 @@ def test_only_what_is_wanted(wanted: tuple[bool, bool]) -> None:
     assert_close(of_level(KERNEL, *images, wanted), of_level(PLAIN, *images, wanted))
 
 
+def steps_of(
+    steps: Steps, size: tuple[int, int], true_means: bool, dtype: torch.dtype
+) -> list[Tensor]:
+    """Return the planes of a decomposition, and the gradient of their weighted sum."""
+    generator = torch.Generator().manual_seed(sum(size))
+    image = torch.rand(2, 3, *size, generator=generator, dtype=torch.float64).to(dtype)
+    cortex = Haar().decompose(image.requires_grad_(), steps, true_means)
+    planes = [*cortex.details, *cortex.lowpass, *(cortex.windows or ())]
+    weights = (torch.rand(plane.shape, generator=generator) for plane in planes)
+    total = torch.stack([(p * w).sum() for p, w in zip(planes, weights, strict=True)]).sum()
+    (slope,) = torch.autograd.grad(total, image)
+    return [*(plane.detach() for plane in planes), slope]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("true_means", [True, False])
+@pytest.mark.parametrize("size", [(2, 1), (1, 9), (16, 16), (33, 20), (6, 64)], ids=str)
+def test_a_decomposition_is_the_models(
+    size: tuple[int, int], true_means: bool, dtype: torch.dtype
+) -> None:
+    actual, expected = (steps_of(steps, size, true_means, dtype) for steps in (KERNEL, Steps()))
+    assert_close(actual, expected)
+
+
+def test_a_uniform_image_has_no_details() -> None:
+    image = torch.full((1, 3, 13, 6), 0.7)
+    for details in Haar().decompose(image, KERNEL, True).details:
+        assert torch.count_nonzero(details) == 0
+
+
+@pytest.mark.parametrize(
+    ("size", "before"), [((1, 1), (0, 0)), ((2, 65), (1, 1)), ((7, 12), (0, 1))], ids=str
+)
+def test_a_step_down_is_the_models(size: tuple[int, int], before: tuple[int, int]) -> None:
+    above = [(side + first + 1) // 2 for side, first in zip(size, before, strict=True)]
+    generator = torch.Generator().manual_seed(sum(size))
+    planes = [
+        torch.rand(2, 1, *each, dtype=torch.float64, generator=generator)
+        for each in (size, above, size, size)
+    ]
+    found = []
+    for step in (passed_down_by_kernel, passed_down):
+        leaves = [plane.clone().requires_grad_() for plane in planes[:3]]
+        passed = step(leaves[0], leaves[1], Charge(leaves[2], None), before)
+        found.append([passed.detach(), *torch.autograd.grad((passed * planes[3]).sum(), leaves)])
+    assert_close(*found)
+
+
 def pair(height: int, width: int) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(1)
     test, reference = torch.rand(2, 1, 3, height, width, dtype=torch.float64, generator=generator)
@@ -200,7 +255,7 @@ def test_grey_images_too() -> None:
 
 def test_strips_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "STRIP", 512)
-    monkeypatch.setattr(kernel, "BLOCK", LARGE_BLOCK)
+    monkeypatch.setattr(kernels, "BLOCK", LARGE_BLOCK)
     images = pair(66, 17)
     strips = VDM(schedule=Schedule("strips", kernel=True))
     torch.testing.assert_close(strips(*images), VDM()(*images))
@@ -241,7 +296,6 @@ def test_what_it_cannot_do_is_done_by_the_models_steps() -> None:
         ({"transform": Steerable()}, "with Steerable"),
         ({"transform": Haar("filter")}, "with Haar"),
         ({"effects": Effects(pooling=False)}, "with effects left out"),
-        ({"schedule": Schedule(kernel=True, stacked=True)}, "stacked"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -253,7 +307,7 @@ def test_what_has_no_kernel_is_refused(options: dict[str, Any], told: str) -> No
 
 
 def test_a_missing_triton_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kernel, "find_spec", lambda _: None)
+    monkeypatch.setattr(kernels, "find_spec", lambda _: None)
     with pytest.raises(ValueError, match=r"expected Triton .*: pip install triton"):
         VDM(schedule=KERNEL)
 
@@ -265,18 +319,23 @@ import torch, triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from torch_vdm import VDM
-from torch_vdm.run import triton_level
+from torch_vdm.run.kernels import triton_descent, triton_haar, triton_level
 from torch_vdm.run.schedule import Schedule
 image = torch.rand(1, 3, 8, 8)
 try:
     VDM(schedule=Schedule(kernel=True))(image, image)
 except ValueError as error:
     print(error)
-for kernel in (triton_level.local_difference, triton_level.slopes, triton_level.gradients):
-    constants = {name: True for name in kernel.arg_names if name in ("first", "second")}
+names = {
+    triton_level: ("local_difference", "slopes", "gradients"),
+    triton_haar: ("analysis", "synthesis"),
+    triton_descent: ("descent", "ascent"),
+}
+for module, kernel in ((m, getattr(m, name)) for m in names for name in names[m]):
+    constants = {name: True for name in kernel.arg_names if name in ("first", "second", "border")}
     constants["block"] = 128
-    types = {name: "*fp32" for name in triton_level.PLANES}
-    types |= {name: "i32" for name in triton_level.SIZES}
+    types = {name: "*fp32" for name in module.PLANES}
+    types |= {name: "i32" for name in module.SIZES}
     types |= {name: "constexpr" for name in constants}
     source = ASTSource(kernel, {name: types[name] for name in kernel.arg_names}, constants)
     compiled = triton.compile(source, GPUTarget("cuda", 80, 32), {"enable_fp_fusion": False})
@@ -291,4 +350,4 @@ for kernel in (triton_level.local_difference, triton_level.slopes, triton_level.
     assert refusal.startswith(
         "expected images on a GPU for a schedule with the kernel, got them on"
     )
-    assert compiled == ["True"] * 3
+    assert compiled == ["True"] * 7

@@ -1,8 +1,8 @@
 """A level's local visual difference and its gradient, as kernels of Triton.
 
 They compute what `torch_vdm.model.level` does from channel weighting to distance summation, for the
-signed observer with `Haar`, where the summation exponent is 6. `torch_vdm.run.kernel` launches
-them; only it imports this, since Triton may not be installed.
+signed observer with `Haar`, where the summation exponent is 6. `torch_vdm.run.kernels.level`
+launches them; only it imports this, since Triton may not be installed.
 
 A program has a block of nodes, or of parents, of one item. What a node needs of its neighbours is
 computed again for each node, so that nothing is written in between. Planes are contiguous: details

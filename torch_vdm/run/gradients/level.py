@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from torch_vdm.model.contrast import LARGEST, local_contrast, opponents
 from torch_vdm.model.distance import SMALLEST_DIFFERENCE
@@ -30,6 +29,7 @@ def local_difference_by_hand(
     matrix: Tensor,
     masking: Tensor,
     summation: Tensor,
+    cubes: bool,
 ) -> Tensor:
     """Return ``function`` of two images, their local visual difference, with its gradient by hand.
 
@@ -43,24 +43,12 @@ def local_difference_by_hand(
         (channels, 3), of Eq. 3.
     masking, summation
         The exponents of `unmasked` and of `local_visual_difference`.
+    cubes
+        Whether the latter is 6.
     """
-    around = function, matrix, masking, summation
+    around = function, matrix, masking, summation, cubes
     local: Tensor = _LocalDifference.apply(*around, details, *sight, others, *other_sight)
     return local
-
-
-def by_hand() -> bool:
-    """Return whether this gradient can be used, and is of use."""
-    return torch.is_grad_enabled() and is_plain()
-
-
-def is_plain() -> bool:
-    """Return whether nothing traces or transforms the computation."""
-    return (
-        not torch.compiler.is_compiling()
-        and not torch._C._are_functorch_transforms_active()
-        and forward_ad._current_level < 0
-    )
 
 
 class _LocalDifference(torch.autograd.Function):
@@ -71,16 +59,17 @@ class _LocalDifference(torch.autograd.Function):
         matrix: Tensor,
         masking: Tensor,
         summation: Tensor,
+        cubes: bool,
         *images: Tensor,
     ) -> Tensor:
-        ctx.function, ctx.constants = function, (matrix, masking, summation)
+        ctx.function, ctx.constants = function, (matrix, masking, summation, cubes)
         ctx.save_for_backward(*images)
         return _apply(function, images)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         images: tuple[Tensor, ...] = ctx.saved_tensors
-        wanted: tuple[bool, ...] = ctx.needs_input_grad[4:]
+        wanted: tuple[bool, ...] = ctx.needs_input_grad[5:]
         if torch.is_grad_enabled():
             # It will be differentiated again, so this is left to autograd.
             images = tuple(image if image is None else image.view_as(image) for image in images)
@@ -90,7 +79,7 @@ class _LocalDifference(torch.autograd.Function):
             slopes = [next(found) if want else None for want in wanted]
         else:
             slopes = _slopes(images, wanted, gradient, *ctx.constants)
-        return None, None, None, None, *slopes
+        return None, None, None, None, None, *slopes
 
 
 def _apply(function: Callable[..., Tensor], images: Sequence[Tensor]) -> Tensor:
@@ -105,6 +94,7 @@ def _slopes(
     matrix: Tensor,
     masking: Tensor,
     summation: Tensor,
+    cubes: bool,
 ) -> list[Tensor | None]:
     """Return the gradients with respect to those of the ``images`` that are ``wanted``."""
     one, other = (_weighted(image, matrix) for image in (images[:3], images[3:]))
@@ -115,12 +105,16 @@ def _slopes(
     gain = torch.log2(masks).sub_(1.0).mul_(-2.0 * masking).exp2_()
     half = 0.5 * summation
     energy.mul_(gain)
-    slope = torch.log2(energy.clamp_min(SMALLEST_DIFFERENCE)).mul_(half - 1.0).exp2_()
-    slope.mul_(gradient.unsqueeze(2) * half)
-    # With a repeated border the box is its own transpose. The slope of a square is twice its root.
+    if cubes:
+        slope = energy * energy
+    else:
+        slope = torch.log2(energy.clamp_min(SMALLEST_DIFFERENCE)).mul_(half - 1.0).exp2_()
+    # The slope of a square is twice its root.
+    slope.mul_(gradient.unsqueeze(2) * (2.0 * half))
+    # With a repeated border the box is its own transpose.
     hidden = (slope * energy).sum(2, keepdim=True).mul_(-2.0 * masking).div_(masks)
-    by_square = pool(surround(hidden)).mul_(2.0)
-    by_difference = pool(surround(slope.mul_(gain))).mul_(difference).mul_(2.0)
+    by_square = pool(surround(hidden))
+    by_difference = pool(surround(slope.mul_(gain))).mul_(difference)
     return [
         *_by_image(images[:3], one, by_difference, by_square, matrix, wanted[:3]),
         *_by_image(images[3:], other, by_difference.neg_(), by_square, matrix, wanted[3:]),
@@ -175,7 +169,8 @@ def _by_image(
     if wanted[2]:
         by_sensitivity = path.opponent.mul_(by_weighted).sum_to_size(sensitivity.shape)
     by_contrast = mix(matrix.T, by_weighted.mul_(sensitivity))
-    by_contrast.mul_(path.contrast.abs_() < LARGEST)
+    # 0 where the contrast was kept `within` its limit.
+    by_contrast = torch.ops.aten.hardtanh_backward(by_contrast, path.contrast, -LARGEST, LARGEST)
     by_scale = (by_contrast * details).sum(2) if wanted[1] else None
     by_details = by_contrast.mul_(scale.unsqueeze(2)) if wanted[0] else None
     return by_details, by_scale, by_sensitivity

@@ -1,0 +1,54 @@
+"""Parts of the model as kernels of Triton, forward and backward, for GPUs.
+
+A step of `Haar` and a level's local visual difference are one launch each, and one and two for
+their gradients, where the model's steps are many operations, each of which a GPU waits for. On a
+processor only Triton's interpreter runs kernels, for tests: it does so where TRITON_INTERPRET=1 was
+set before they are first used.
+"""
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import torch
+
+from torch_vdm.effects import Effects
+from torch_vdm.model.cortex import Haar, Transform
+from torch_vdm.observer import Observer
+
+# Nodes, or parents, of a program. Status: choice, not measured.
+BLOCK = 128
+
+# The summation exponent that the kernels are written for: that of the calibrated observer.
+EXPONENT = 6.0
+
+
+def require(observer: Observer, transform: Transform, effects: Effects) -> None:
+    """Raise ValueError where there are no kernels for these options, or no Triton."""
+    known = (
+        observer.signed
+        and observer.adaptation_luminance is None
+        and observer.summation_exponent == EXPONENT
+    )
+    for right, what in (
+        (known, f'with the observer "{observer.name}"; it is of the calibrated one'),
+        (transform == Haar(), f"with {transform}; it is of Haar() alone"),
+        (effects == Effects(), "with effects left out; it has all of them"),
+    ):
+        if not right:
+            raise ValueError(f"expected a schedule without the kernel, got one {what}")
+    if find_spec("triton") is None:
+        raise ValueError(
+            "expected Triton for a schedule with the kernel, got none: pip install triton"
+        )
+
+
+def of(module: str, device: torch.device) -> Any:
+    """Return a module of kernels; raise ValueError if they cannot run on a device."""
+    kernels = import_module(f"torch_vdm.run.kernels.{module}")
+    if device.type == "meta" or (device.type == "cpu" and not kernels.INTERPRETED):
+        raise ValueError(
+            f"expected images on a GPU for a schedule with the kernel, got them on {device}; leave "
+            "the kernel out, or set TRITON_INTERPRET=1 to try it slowly"
+        )
+    return kernels
