@@ -109,9 +109,9 @@ def timed(contenders: dict[str, Callable[[], Tensor]], rounds: int) -> dict[str,
     """Return the median seconds of each, of interleaved rounds."""
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     for number in range(rounds + 1):
-        for name, contender in contenders.items():
+        for name in record.in_turn(contenders, number):
             start = time.perf_counter()
-            contender()
+            contenders[name]()
             if number:
                 seconds[name].append(time.perf_counter() - start)
     return {name: statistics.median(each) for name, each in seconds.items()}

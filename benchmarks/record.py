@@ -8,6 +8,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,6 +88,15 @@ def measured_apart(
     )
     figures: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
     return figures
+
+
+def in_turn(names: Iterable[str], number: int) -> list[str]:
+    """Return names in order, or every second time from the last to the first.
+
+    None then always runs in what the same other one leaves behind.
+    """
+    each = list(names)
+    return each[::-1] if number % 2 else each
 
 
 def blank_figure(width: float, height: float, dpi: int = 150) -> "Figure":

@@ -46,7 +46,7 @@ OWN = {
 ASK_TOO_MUCH = ("plane", "open", "dim_room")
 
 # Sides of pictures whose difference is looked at and of whole runs, samples, rounds; with --quick.
-FULL = {"side": 96, "run": 512, "count": 96, "rounds": 5, "runs": 3, "most": 32}
+FULL = {"side": 96, "run": 512, "count": 96, "rounds": 5, "runs": 4, "most": 32}
 QUICK = {"side": 16, "run": 24, "count": 16, "rounds": 1, "runs": 1, "most": 16}
 
 # What is wanted: times as fast, times as slow, and the share of the tolerance that is missing.
@@ -96,9 +96,9 @@ def seconds(
     """Return the median processor time of each, of interleaved rounds, and others before them."""
     spent: dict[str, list[float]] = {name: [] for name in contenders}
     for number in range(rounds + before):
-        for name, contender in contenders.items():
+        for name in record.in_turn(contenders, number):
             start = time.process_time()
-            contender(number)
+            contenders[name](number)
             if number >= before:
                 spent[name].append(time.process_time() - start)
     return {name: statistics.median(each) for name, each in spent.items()}

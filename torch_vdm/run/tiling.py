@@ -167,11 +167,14 @@ class Tiling:
             return self.grid
         return self.grid.part((part[0].start, part[1].start), self.levels + 1)
 
-    def joined(self, parts: Sequence[Tensor]) -> Tensor:
-        """Return the plane of the image from one part (B, C, h, w) per tile, row by row."""
-        across = self.across
-        rows = [torch.cat(list(parts[n : n + across]), -1) for n in range(0, len(parts), across)]
-        return torch.cat(rows, -2)
+    def new_plane(self, like: Tensor, node: int) -> Tensor:
+        """Return an empty plane (B, C, h, w) of the image with nodes of ``node`` pixels.
+
+        ``like``: that of a tile.
+        """
+        image = slice(0, self.size[0]), slice(0, self.size[1])
+        rows, columns = Tile(image, image, self.grid).of_image(node)
+        return like.new_empty(*like.shape[:-2], rows.stop, columns.stop)
 
     def split_rows(self, image: Tensor) -> Iterator[Tensor]:
         """Yield the rows of an image (B, C, H, W) that each strip is computed from.
@@ -189,14 +192,9 @@ class Tiling:
         """Whether the image is no larger than a tile."""
         return all(side <= most for side, most in zip(self.size, self.sides, strict=True))
 
-    @property
-    def across(self) -> int:
-        """The number of tiles in a row."""
-        return len(self._parts(1))
-
     def __len__(self) -> int:
         """Return the number of tiles."""
-        return self.across * len(self._parts(0))
+        return len(self._parts(0)) * len(self._parts(1))
 
     def __iter__(self) -> Iterator[Tile]:
         """Yield the tiles, row by row."""
