@@ -24,7 +24,7 @@ LARGEST_AT_ONCE = 2**18
 
 # Pixels of a strip of a large image, and how many levels, from the finest, are computed in strips.
 # Status: choice, measured.
-STRIP, STRIP_LEVELS = 2**19, 2
+STRIP, STRIP_LEVELS = 3 * 2**17, 2
 
 # Pixels of a strip in which a large image is filtered. Status: choice, measured.
 BAND_STRIP = 2**17
