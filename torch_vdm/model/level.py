@@ -37,8 +37,8 @@ from torch_vdm.model.pooling import (
 from torch_vdm.model.quadtree import push, surround
 from torch_vdm.model.steps import PLAIN, Steps
 
-# The constants that the sensitivity at the local luminance depends on; `torch_vdm.run.triton_level`
-# finds each by its place here.
+# The constants that the sensitivity at the local luminance depends on;
+# `torch_vdm.run.kernels.triton_level` finds each by its place here.
 OF_LUMINANCE = (
     "luminance_of_cones",
     "dark_light",

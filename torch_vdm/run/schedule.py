@@ -87,8 +87,7 @@ class Schedule(Steps):
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return what a step returns, using its compiled form where that pays."""
         first = _first(arguments)
-        by_kernel = self.kernel and function in BY_KERNEL and is_plain()
-        if by_kernel or not self._compiles(first):
+        if self._has_kernel(function) or not self._compiles(first):
             return self.form(function, first)(*arguments)
         items = first.shape[0]
         if not self.stacked or items == 1:
@@ -97,7 +96,7 @@ class Schedule(Steps):
 
     def form(self, function: Callable[..., Any], first: Tensor) -> Callable[..., Any]:
         """Return what gives the same as a step, uncompiled, if its first plane is ``first``."""
-        if self.kernel and function in BY_KERNEL and is_plain():
+        if self._has_kernel(function):
             return BY_KERNEL[function]
         return BY_HAND.get(function, function) if first.requires_grad and by_hand() else function
 
@@ -108,6 +107,10 @@ class Schedule(Steps):
             return self(function, around, *arguments)
         found = compiled(function)(*below((around, *arguments), items))
         return apart(found, items, rows_lost(around, found, items))
+
+    def _has_kernel(self, function: Callable[..., Any]) -> bool:
+        """Return whether a step is computed by a kernel."""
+        return self.kernel and function in BY_KERNEL and is_plain()
 
     def _compiles(self, first: Tensor) -> bool:
         """Return whether a step with this first plane is compiled."""

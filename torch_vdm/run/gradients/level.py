@@ -103,14 +103,15 @@ def _slopes(
     masks = pool(surround(masking_energy(one.weighted, other.weighted))).add_(1.0)
     # The energy times the factor of `unmasked`; then its power of half the summation exponent.
     gain = torch.log2(masks).sub_(1.0).mul_(-2.0 * masking).exp2_()
-    half = 0.5 * summation
     energy.mul_(gain)
     if cubes:
         slope = energy * energy
     else:
-        slope = torch.log2(energy.clamp_min(SMALLEST_DIFFERENCE)).mul_(half - 1.0).exp2_()
+        slope = (
+            torch.log2(energy.clamp_min(SMALLEST_DIFFERENCE)).mul_(0.5 * summation - 1.0).exp2_()
+        )
     # The slope of a square is twice its root.
-    slope.mul_(gradient.unsqueeze(2) * (2.0 * half))
+    slope.mul_(gradient.unsqueeze(2) * summation)
     # With a repeated border the box is its own transpose.
     hidden = (slope * energy).sum(2, keepdim=True).mul_(-2.0 * masking).div_(masks)
     by_square = pool(surround(hidden))

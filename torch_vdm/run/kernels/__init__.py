@@ -1,16 +1,18 @@
 """Parts of the model as kernels of Triton, forward and backward, for GPUs.
 
-A step of `Haar` and a level's local visual difference are one launch each, and one and two for
-their gradients, where the model's steps are many operations, each of which a GPU waits for. On a
-processor only Triton's interpreter runs kernels, for tests: it does so where TRITON_INTERPRET=1 was
-set before they are first used.
+A step of `Haar`, a level's local visual difference and a step down the quad-tree are one launch
+each, and one, two and one for their gradients, where the model's steps are many operations, each of
+which a GPU waits for. On a processor only Triton's interpreter runs kernels, for tests: it does so
+where TRITON_INTERPRET=1 was set before they are first used.
 """
 
+from collections.abc import Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from torch_vdm.effects import Effects
 from torch_vdm.model.cortex import Haar, Transform
@@ -52,3 +54,19 @@ def of(module: str, device: torch.device) -> Any:
             "the kernel out, or set TRITON_INTERPRET=1 to try it slowly"
         )
     return kernels
+
+
+def launch(
+    kernel: Any,
+    nodes: int,
+    items: int,
+    planes: Sequence[Tensor],
+    sizes: Sequence[int],
+    **constants: bool,
+) -> None:
+    """Launch a kernel with a program for each block of ``nodes`` of each of so many ``items``."""
+    with torch.cuda.device_of(planes[0]):
+        # A difference of two products is not fused, for it must be 0 where both are equal.
+        kernel[-(-nodes // BLOCK), items](
+            *planes, *sizes, **constants, block=BLOCK, enable_fp_fusion=False
+        )

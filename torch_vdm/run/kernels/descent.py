@@ -5,21 +5,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_vdm.model.charging import Charge
-from torch_vdm.model.distance import passed_down
 from torch_vdm.model.grid import Before
 from torch_vdm.run import kernels
-from torch_vdm.run.gradients.descent import gradients_of_passed_down
-
-
-def passed_down_by_kernel(
-    nodes: Tensor, total: Tensor, charge: Charge | None, before: Before
-) -> Tensor:
-    """Return `passed_down`; the kernel is for nodes that are charged all of their own."""
-    if charge is None or charge.own is not None:
-        return passed_down(nodes, total, charge, before)
-    passed: Tensor = _PassedDown.apply(nodes, total, charge.inherited, before)
-    return passed
+from torch_vdm.run.gradients.descent import gradients_of_passed_down, passed_down_by
 
 
 class _PassedDown(torch.autograd.Function):
@@ -50,7 +38,8 @@ def _launch(name: str, planes: tuple[Tensor, ...], before: Before) -> None:
     nodes, parents = planes[0], planes[1]
     kernel = getattr(kernels.of("triton_descent", nodes.device), name)
     written = nodes if name == "descent" else parents
-    grid = -(-written[0].numel() // kernels.BLOCK), len(nodes)
     sizes = *nodes.shape[-2:], *parents.shape[-2:], *before
-    with torch.cuda.device_of(nodes):
-        kernel[grid](*planes, *sizes, block=kernels.BLOCK, enable_fp_fusion=False)
+    kernels.launch(kernel, written[0].numel(), len(nodes), planes, sizes)
+
+
+passed_down_by_kernel = passed_down_by(_PassedDown)

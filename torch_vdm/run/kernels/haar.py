@@ -79,7 +79,6 @@ def _launch(name: str, even: Tensor, lowpass: Tensor, *others: Tensor) -> None:
     planes = [even, lowpass, *others]
     border = len(planes) > 3
     planes += [even] * (7 - len(planes))  # not used
-    size = lowpass.shape[-2], lowpass.shape[-1]
-    grid = -(-size[0] * size[1] // kernels.BLOCK), lowpass[..., 0, 0].numel()
-    with torch.cuda.device_of(even):
-        kernel[grid](*planes, *size, border=border, block=kernels.BLOCK, enable_fp_fusion=False)
+    height, width = lowpass.shape[-2:]
+    items = lowpass[..., 0, 0].numel()
+    kernels.launch(kernel, height * width, items, planes, (height, width), border=border)

@@ -148,7 +148,4 @@ def _launch(
 ) -> None:
     """Launch a kernel with a program for each block of ``nodes`` of each item."""
     sizes = *images[0].shape[-2:], *images[2].shape[-2:], *before
-    grid = -(-nodes // kernels.BLOCK), len(images[0])
-    with torch.cuda.device_of(images[0]):
-        # A difference of two products is not fused, for it must be 0 where both are equal.
-        kernel[grid](*arguments, *sizes, **constants, block=kernels.BLOCK, enable_fp_fusion=False)
+    kernels.launch(kernel, nodes, len(images[0]), arguments, sizes, **constants)
