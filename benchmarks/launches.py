@@ -31,7 +31,9 @@ WANTED = {"map": 250, "loss": 400}
 WANTED_COMPILED = {"map": 60, "loss": 120}
 
 # Without a kernel, beside what PyTorch marks as a view.
-NO_KERNEL = ("empty", "empty_like", "new_empty", "empty_strided", "detach", "lift_fresh")
+NO_KERNEL = (
+    *("empty", "empty_like", "new_empty", "empty_strided", "detach", "lift_fresh", "_unsafe_view"),
+)
 
 Contender = Callable[[Tensor, Tensor], Any]
 
@@ -186,6 +188,7 @@ def _launched() -> Iterator[None]:
         "synthesis",
         "descent",
         "ascent",
+        "finite_in_both",
     )
     fake = SimpleNamespace(numbers_of=triton_level.numbers_of)
     vars(fake).update((name, _OneOperation()) for name in names)

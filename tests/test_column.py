@@ -5,7 +5,7 @@ import torch
 
 from torch_vdm import Haar
 from torch_vdm.model.quadtree import push, surround
-from torch_vdm.run.column import cells_of, column_of
+from torch_vdm.run.column import cells_of, column_of, joined
 
 SIZES = [(1, 1), (1, 9), (2, 129), (40, 1), (24, 17), (33, 64)]
 
@@ -17,7 +17,7 @@ def test_a_node_gets_what_is_pushed_to_it(size: tuple[int, int], true_means: boo
     planes = cortex.lowpass
     sizes = tuple((plane.shape[-2], plane.shape[-1]) for plane in planes)
     column = column_of(sizes, cortex.before or [(0, 0)], planes[0])
-    nodes = column.of(planes)
+    nodes = joined(planes)
     for back, plane in zip(column.planes(nodes), planes, strict=True):
         assert torch.equal(back, plane)
     above = column.planes(column.of_parents(nodes))
@@ -39,7 +39,7 @@ def test_a_cell_is_a_level_with_its_border_repeated(
         column_of(sizes, [(0, 0)] * len(sizes), planes[0]),
         cells_of(sizes, ring, planes[0]),
     )
-    plane = cells.of(column.of(planes))
+    plane = cells.of(joined(planes))
     before, after = ring
     inside = plane[..., before : plane.shape[-2] - after, before : plane.shape[-1] - after]
     # A plane without rings begins at the same place as the ring of a level with them.
@@ -47,4 +47,4 @@ def test_a_cell_is_a_level_with_its_border_repeated(
         y, x = divmod(int(places[0, 0]), inside.shape[-1])
         height, width = (side + before + after for side in level.shape[-2:])
         assert torch.equal(plane[..., y : y + height, x : x + width], surround(level, *ring))
-    assert torch.equal(cells.column(inside), column.of(planes))
+    assert torch.equal(cells.column(inside), joined(planes))

@@ -32,6 +32,25 @@ def test_nothing_is_read_back_from_the_device(transform: Transform, observer: Ob
         assert VDM(transform=transform, observer=observer)(test, reference).shape == (2, 1, 21, 34)
 
 
+@each_transform
+def test_nothing_comes_from_the_processor_after_the_first_call(
+    transform: Transform, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A copy to a GPU waits for it, and none can be captured in a graph.
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("numbers become a tensor")
+
+    loss = VDMLoss(transform=transform, nonfinite="mask")
+    test, reference = torch.rand(2, 1, 3, 21, 34)
+    for call in range(2):
+        loss.metric(test, reference)
+        loss(test.requires_grad_(), reference).backward()
+        if call == 0:
+            for owner, name in ((torch, "tensor"), (torch, "as_tensor"), (torch, "from_numpy")):
+                monkeypatch.setattr(owner, name, refuse)
+            monkeypatch.setattr(torch.Tensor, "new_tensor", refuse)
+
+
 def test_nothing_is_read_back_by_sarnoffs_model() -> None:
     with FakeTensorMode():
         image = torch.rand(1, 3, 20, 30)

@@ -24,6 +24,7 @@ SCHEDULES = {
     "levels one by one": Schedule(few=0),
     "both images together": Schedule(together=True, few=64),
     "a GPU's": ACCELERATED,
+    "a GPU's, compiled": dataclasses.replace(ACCELERATED, compiled=True),
     "a GPU's, computed again": dataclasses.replace(ACCELERATED, again=True, few=16),
     "strips": Schedule("strips", few=64),
     "computed again": Schedule("strips", again=True, few=16),

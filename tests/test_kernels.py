@@ -14,15 +14,18 @@ from torch import Tensor
 
 from benchmarks.places import ROOT
 from torch_vdm import VDM, Effects, Haar, Observer, Steerable, VDMLoss
+from torch_vdm.images import finite_in_both
 from torch_vdm.model.charging import Charge
 from torch_vdm.model.cortex import Cortex
-from torch_vdm.model.distance import passed_down
+from torch_vdm.model.distance import Paths, accumulate
 from torch_vdm.model.grid import Grid
 from torch_vdm.model.steps import Steps
 from torch_vdm.run import kernels
 from torch_vdm.run import schedule as limits
+from torch_vdm.run.column import joined
 from torch_vdm.run.kernels import level as of_a_level
-from torch_vdm.run.kernels.descent import passed_down_by_kernel
+from torch_vdm.run.kernels.descent import accumulated
+from torch_vdm.run.kernels.mask import finite_in_both as finite_in_both_by_kernel
 from torch_vdm.run.schedule import Schedule
 
 pytest.importorskip("triton", reason="Triton is not installed")
@@ -41,10 +44,9 @@ def interpreted() -> Iterator[None]:
     # Set while the kernels are made, and only then: other tests compile by Triton.
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TRITON_INTERPRET", "1")
-        from torch_vdm.run.kernels import triton_descent, triton_haar, triton_level
-    assert triton_descent.INTERPRETED
-    assert triton_haar.INTERPRETED
-    assert triton_level.INTERPRETED
+        from torch_vdm.run.kernels import triton_descent, triton_haar, triton_level, triton_mask
+    for module in (triton_descent, triton_haar, triton_level, triton_mask):
+        assert module.INTERPRETED
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels, "BLOCK", BLOCK)
         yield
@@ -192,9 +194,13 @@ def steps_of(
     return [*(plane.detach() for plane in planes), slope]
 
 
+def decomposed(size: tuple[int, int]) -> Cortex:
+    return Haar().decompose(torch.zeros(1, 3, *size), true_means=True)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("true_means", [True, False])
-@pytest.mark.parametrize("size", [(2, 1), (1, 9), (16, 16), (33, 20), (6, 64)], ids=str)
+@pytest.mark.parametrize("size", [(2, 1), (1, 9), (3, 3), (16, 16), (33, 20), (6, 64)], ids=str)
 def test_a_decomposition_is_the_models(
     size: tuple[int, int], true_means: bool, dtype: torch.dtype
 ) -> None:
@@ -208,22 +214,65 @@ def test_a_uniform_image_has_no_details() -> None:
         assert torch.count_nonzero(details) == 0
 
 
-@pytest.mark.parametrize(
-    ("size", "before"), [((1, 1), (0, 0)), ((2, 65), (1, 1)), ((7, 12), (0, 1))], ids=str
-)
-def test_a_step_down_is_the_models(size: tuple[int, int], before: tuple[int, int]) -> None:
-    above = [(side + first + 1) // 2 for side, first in zip(size, before, strict=True)]
+@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("size", [(1, 2), (9, 5), (33, 70)], ids=str)
+def test_the_way_down_is_the_models(size: tuple[int, int], batch: int) -> None:
+    grid = Haar().grid(size, true_means=True)
+    sizes = [(plane.shape[-2], plane.shape[-1]) for plane in decomposed(size).lowpass]
+    before = grid.down(len(sizes))
     generator = torch.Generator().manual_seed(sum(size))
-    planes = [
-        torch.rand(2, 1, *each, dtype=torch.float64, generator=generator)
-        for each in (size, above, size, size)
-    ]
+
+    def planes(*sides: tuple[int, int]) -> list[Tensor]:
+        return [
+            torch.rand(batch, 1, *each, dtype=torch.float64, generator=generator) for each in sides
+        ]
+
+    local, shares, (root, weights) = planes(*sizes), planes(*sizes), planes((1, 1), sizes[-1])
     found = []
-    for step in (passed_down_by_kernel, passed_down):
-        leaves = [plane.clone().requires_grad_() for plane in planes[:3]]
-        passed = step(leaves[0], leaves[1], Charge(leaves[2], None), before)
-        found.append([passed.detach(), *torch.autograd.grad((passed * planes[3]).sum(), leaves)])
+    for by_kernel in (True, False):
+        leaves = [plane.clone().requires_grad_() for plane in (*local, *shares, root)]
+        of = tuple(leaves[: len(sizes)])
+        charges = [Charge(share, None) for share in leaves[len(sizes) : -1]]
+        if by_kernel:
+            column = Charge(joined([charge.inherited for charge in charges]), None)
+            total = accumulated(Paths(of, (), leaves[-1]), column, before)
+        else:
+            total = accumulate(of, leaves[-1], before, charges)
+        slopes = torch.autograd.grad((total * weights).sum(), leaves)
+        found.append([total.detach(), *slopes])
     assert_close(*found)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("size", [(1, 1), (5, 7), (64, 64), (70, 130)], ids=str)
+def test_what_is_not_finite_is_replaced_as_ever(size: tuple[int, int], dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(sum(size))
+    test, reference = torch.rand(2, 2, 3, *size, generator=generator, dtype=dtype)
+    lost = torch.rand(2, 2, 3, *size, generator=generator) < 0.2
+    test[lost[0]], reference[lost[1]] = torch.nan, -torch.inf
+    # Of one item no square up to the largest has a finite pixel.
+    test[1, 0, :64, :64], reference[1, 2, :64, :64] = torch.inf, torch.nan
+    expected, actual = (of(test, reference) for of in (finite_in_both, finite_in_both_by_kernel))
+    assert torch.equal(actual[2], expected[2])
+    assert actual[2].dtype == torch.bool
+    assert_close(list(actual[:2]), list(expected[:2]))
+    assert torch.equal(actual[0][1, :, :64, :64], torch.zeros_like(test[1, :, :64, :64]))
+
+
+def test_gradients_pass_where_both_images_are_finite() -> None:
+    test, reference = torch.rand(2, 1, 3, 6, 5)
+    test[..., 2, 3] = torch.nan
+    for wanted in ((True, True), (True, False), (False, True)):
+        leaves = [
+            image.clone().requires_grad_(want)
+            for image, want in zip((test, reference), wanted, strict=True)
+        ]
+        *images, seen = finite_in_both_by_kernel(*leaves)
+        assert tuple(image.requires_grad for image in images) == wanted
+        for image, leaf in zip(images, leaves, strict=True):
+            if leaf.requires_grad:
+                (slope,) = torch.autograd.grad((image * image).sum(), leaf, retain_graph=True)
+                assert torch.equal(slope, torch.where(seen, 2.0 * leaf.detach(), 0.0))
 
 
 def pair(height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -245,6 +294,19 @@ def test_maps_and_losses() -> None:
     schedule = Schedule(kernel=True, together=True, cached=False, few=limits.EVERY_LEVEL)
     actual, expected = (map_and_gradients(each, images) for each in (schedule, PLAIN))
     assert_close(actual, expected)
+
+
+def test_masked_maps_and_losses() -> None:
+    images = pair(9, 6)
+    images[0][..., 3, 2], images[1][..., 3, 2] = torch.nan, torch.inf
+    found = []
+    for schedule in (KERNEL, PLAIN):
+        test = images[0].clone().requires_grad_()
+        loss = VDMLoss(30.0, schedule=schedule, nonfinite="mask")
+        with torch.no_grad():
+            jnd = loss.metric(*images)
+        found.append([jnd, *torch.autograd.grad(loss(test, images[1]), test)])
+    assert_close(*found)
 
 
 def test_grey_images_too() -> None:
@@ -319,7 +381,7 @@ import torch, triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from torch_vdm import VDM
-from torch_vdm.run.kernels import triton_descent, triton_haar, triton_level
+from torch_vdm.run.kernels import triton_descent, triton_haar, triton_level, triton_mask
 from torch_vdm.run.schedule import Schedule
 image = torch.rand(1, 3, 8, 8)
 try:
@@ -330,11 +392,14 @@ names = {
     triton_level: ("local_difference", "slopes", "gradients"),
     triton_haar: ("analysis", "synthesis"),
     triton_descent: ("descent", "ascent"),
+    triton_mask: ("finite_in_both",),
 }
 for module, kernel in ((m, getattr(m, name)) for m in names for name in names[m]):
     constants = {name: True for name in kernel.arg_names if name in ("first", "second", "border")}
-    constants["block"] = 128
+    constants["block"] = 64 if module is triton_mask else 128
     types = {name: "*fp32" for name in module.PLANES}
+    types |= {name: "*i32" for name in getattr(module, "TABLES", ())}
+    types |= {name: "*u8" for name in getattr(module, "BYTES", ())}
     types |= {name: "i32" for name in module.SIZES}
     types |= {name: "constexpr" for name in constants}
     source = ASTSource(kernel, {name: types[name] for name in kernel.arg_names}, constants)
@@ -350,4 +415,4 @@ for module, kernel in ((m, getattr(m, name)) for m in names for name in names[m]
     assert refusal.startswith(
         "expected images on a GPU for a schedule with the kernel, got them on"
     )
-    assert compiled == ["True"] * 7
+    assert compiled == ["True"] * 8

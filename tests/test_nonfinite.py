@@ -63,6 +63,13 @@ def test_what_no_image_has_is_the_mean_around_it() -> None:
     torch.testing.assert_close(filled[..., 4, 4], corner / 3.0)
     block = image[..., 8:16, 8:16].sum((-2, -1)) - image[..., 8:12, 8:12].sum((-2, -1))
     torch.testing.assert_close(filled[..., 9, 10], block / 48.0)
+    # Squares at the border are smaller, and no pixel counts for more than another.
+    image = torch.rand(1, 3, 5, 7, dtype=torch.float64)
+    lost = image.clone()
+    lost[..., 4, :5] = lost[..., :4, 4] = torch.nan
+    filled, *_ = finite_in_both(lost, lost)
+    mean = (image[..., :4, :4].sum((-2, -1)) + image[..., :, 5:].sum((-2, -1))) / 26.0
+    torch.testing.assert_close(filled[..., 4, 0], mean)
     nothing = torch.full((1, 3, 5, 5), torch.nan)
     assert not VDM(nonfinite="mask")(nothing, nothing).any()
 

@@ -210,6 +210,21 @@ def test_large_images_compile_nothing_twice(monkeypatch: pytest.MonkeyPatch) -> 
             assert counters["stats"]["unique_graphs"] == graphs, shape
 
 
+def test_a_gpus_fast_route_compiles_nothing_twice() -> None:
+    # On a GPU reductions and what needs a few numbers are compiled too.
+    from torch._dynamo.utils import counters
+
+    route = schedule.Schedule(together=True, compiled=True, cached=False, few=schedule.EVERY_LEVEL)
+    fast, metric = VDM(schedule=route), VDM()
+    graphs = None
+    with torch.no_grad():
+        for shape in ((2, 40, 56), (2, 64, 64), (5, 47, 101), (3, 16, 300)):
+            pair = images(*shape)
+            torch.testing.assert_close(fast(*pair), metric(*pair), rtol=1e-4, atol=1e-6)
+            graphs = graphs or counters["stats"]["unique_graphs"]
+            assert counters["stats"]["unique_graphs"] == graphs, shape
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_input_is_computed_in_float32(dtype: torch.dtype) -> None:
     metric = VDM()

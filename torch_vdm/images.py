@@ -129,6 +129,6 @@ def _around(sums: Tensor, side: int) -> Tensor:
     total, count = sums[:, :-1], sums[:, -1:]
     if side == 1:
         return torch.where(count > 0.0, total / count, 0.0)
-    wider = _around(functional.avg_pool2d(sums, 2, ceil_mode=True), side // 2)
+    wider = _around(functional.avg_pool2d(sums, 2, ceil_mode=True, divisor_override=4), side // 2)
     wider = push(wider, (sums.shape[-2], sums.shape[-1]))
     return torch.where(count > 0.0, total / count, wider)

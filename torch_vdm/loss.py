@@ -13,7 +13,6 @@ from torch_vdm.model.distance import just_noticeable
 from torch_vdm.observer import Observer
 from torch_vdm.options import choice, number, switch
 from torch_vdm.run import operators
-from torch_vdm.run.schedule import chosen
 from torch_vdm.vdm import VDM
 
 Reduction = Literal["mean", "sum", "none"]
@@ -117,11 +116,14 @@ class VDMLoss(operators.Enrolled):
         """Return the loss of every item, (B,); arguments as in `forward`."""
         test, reference, seen = self.metric._checked(test, reference)
         # The L1 term first: its intermediate results are freed before the metric needs most memory.
-        l1 = self.l1 * self._in_rows(test, reference) if self.l1 else 0.0
+        l1 = self._in_rows(test, reference) if self.l1 else 0.0
         power = self.metric._power(test, reference, seen)
         exponent = self.metric.observer.summation_exponent / EXPONENT
-        plane = torch.log1p(just_noticeable(power, power.new_tensor(exponent))) + l1
-        return plane.mean((1, 2, 3)) if mask is None else self._weighted(plane, mask)
+        once = self.metric.scheduled(test, reference).once
+        if mask is None:
+            items: Tensor = once(mean_of_items, power, exponent, l1, self.l1)
+            return items
+        return self._weighted(once(of_pixels, power, exponent, l1, self.l1), mask)
 
     def compile(self, *args: Any, **kwargs: Any) -> Self:  # type: ignore[override]
         """Switch the metric to its compiled route, `VDM.compile`."""
@@ -129,16 +131,14 @@ class VDMLoss(operators.Enrolled):
         return self
 
     def _in_rows(self, test: Tensor, reference: Tensor) -> Tensor:
-        """Return `_absolute`, a few rows at a time on every route."""
-        job = self.metric._job(test, reference)._replace(compiles=False)
-        schedule = self.metric.schedule or chosen(job)
-        return schedule.pixels(self._absolute, test, reference)
-
-    def _absolute(self, test: Tensor, reference: Tensor) -> Tensor:
-        """Return the mean absolute difference of sRGB-coded values, (B, 1, H, W)."""
+        """Return `absolute_difference`, on a processor a few rows at a time on every route."""
+        schedule = self.metric.scheduled(test, reference)
+        if schedule.cached:
+            schedule = replace(schedule, compiled=False)
         display = self.metric.display
-        difference = display.to_code(test) - display.to_code(reference)
-        return difference.abs().mean(1, keepdim=True)
+        return schedule.pixels(
+            lambda *part: schedule.once(absolute_difference, *part, display), test, reference
+        )
 
     def _weighted(self, plane: Tensor, mask: Tensor) -> Tensor:
         """Return the mean of every item, (B,), weighted by a mask."""
@@ -153,3 +153,22 @@ class VDMLoss(operators.Enrolled):
         return (plane * weights).sum((1, 2, 3)) / weights.sum((1, 2, 3)).clamp_min(
             torch.finfo(plane.dtype).tiny
         )
+
+
+def absolute_difference(test: Tensor, reference: Tensor, display: Display) -> Tensor:
+    """Return the mean absolute difference of sRGB-coded values, (B, 1, H, W)."""
+    difference = display.to_code(test) - display.to_code(reference)
+    return difference.abs().mean(1, keepdim=True)
+
+
+def of_pixels(power: Tensor, exponent: float, absolute: Tensor | float, l1: float) -> Tensor:
+    """Return the loss of every pixel, (B, 1, H, W).
+
+    ``power`` is the map to a power, ``absolute`` the `absolute_difference`, weighted by ``l1``.
+    """
+    return torch.log1p(just_noticeable(power, exponent)) + l1 * absolute
+
+
+def mean_of_items(power: Tensor, exponent: float, absolute: Tensor | float, l1: float) -> Tensor:
+    """Return the mean of every item, (B,), of what `of_pixels` returns."""
+    return of_pixels(power, exponent, absolute, l1).mean((1, 2, 3))

@@ -31,7 +31,7 @@ from torch_vdm.precision import computed_in, look_at, widest
 from torch_vdm.run import operators
 from torch_vdm.run.compiled import for_any_size
 from torch_vdm.run.memory import keep_freed_memory
-from torch_vdm.run.schedule import Job, at_once, chosen
+from torch_vdm.run.schedule import Job, Schedule, at_once, chosen
 
 Nonfinite = Literal["raise", "mask"]
 
@@ -113,6 +113,10 @@ class PairMetric(operators.Enrolled):
             test.device.type not in ("cpu", "meta"),
             torch.compiler.is_compiling(),
         )
+
+    def scheduled(self, test: Tensor, reference: Tensor) -> Schedule:
+        """Return how a pair, (B, 3, H, W) twice, is computed; `repr` shows it."""
+        return chosen(self._job(test, reference))
 
     def _to_pixels(self, plane: Tensor, size: tuple[int, int], grid: Grid | None = None) -> Tensor:
         """Return a plane of `_accumulated`, or of its root, at the resolution of the images.
@@ -206,8 +210,9 @@ class PairMetric(operators.Enrolled):
         test, reference, seen = self._checked(test, reference)
         total = self._total(test, reference)
         constants = self._constants(total.dtype, "summation_exponent")
-        jnd = just_noticeable(total, constants["summation_exponent"])
-        return masked(self._to_pixels(jnd, (test.shape[-2], test.shape[-1])), seen)
+        exponent = constants["summation_exponent"]
+        jnd = self.scheduled(test, reference).once(just_noticeable, total, exponent)
+        return self._at_pixels(jnd, test, reference, seen)
 
     def power(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the accumulated differences before the root is taken: the map to a power.
@@ -223,8 +228,15 @@ class PairMetric(operators.Enrolled):
 
     def _power(self, test: Tensor, reference: Tensor, seen: Tensor | None) -> Tensor:
         """Return `power` of two checked batches."""
-        total = self._total(test, reference)
-        return masked(self._to_pixels(total, (test.shape[-2], test.shape[-1])), seen)
+        return self._at_pixels(self._total(test, reference), test, reference, seen)
+
+    def _at_pixels(
+        self, plane: Tensor, test: Tensor, reference: Tensor, seen: Tensor | None
+    ) -> Tensor:
+        """Return a plane of `_accumulated`, or of its root, as a map of two checked images."""
+        steps = self.scheduled(test, reference)
+        plane = self._to_pixels(plane, (test.shape[-2], test.shape[-1]))
+        return plane if seen is None else steps.once(masked, plane, seen)
 
     def _has_own_constants(self) -> bool:
         """Return whether no constant is replaced, and none requires a gradient."""
@@ -309,12 +321,16 @@ class PairMetric(operators.Enrolled):
         test, reference = test.to(dtype).contiguous(), reference.to(dtype).contiguous()
         seen: Tensor | None = None
         if self.nonfinite == "mask":
-            test, reference, seen = finite_in_both(test, reference)
+            test, reference, seen = self._finite_in_both(test, reference)
         elif self._reads(test):
             require_finite("test", test, origin)
             require_finite("reference", reference, origin)
         self._look_at_range(test, reference)
         return test, reference, seen
+
+    def _finite_in_both(self, test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return `finite_in_both` of two images in the computing precision."""
+        return finite_in_both(test, reference)
 
     def _reads(self, image: Tensor) -> bool:
         """Return whether values are to be read back, to raise if they are wrong."""

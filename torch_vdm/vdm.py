@@ -26,7 +26,9 @@ from torch_vdm.pair import Nonfinite, Numbers, PairMetric
 from torch_vdm.plan import Plan, everything, is_grey, plan_of
 from torch_vdm.precision import computed_in
 from torch_vdm.run import kernels, regions, strips, whole
-from torch_vdm.run.schedule import Schedule, chosen
+from torch_vdm.run.gradients import is_plain
+from torch_vdm.run.kernels import mask as kernel_of_mask
+from torch_vdm.run.schedule import Schedule
 from torch_vdm.run.tiles import Done, Progress, in_tiles
 from torch_vdm.run.tiling import TILE, Source, check_sources, read
 from torch_vdm.sarnoff import Sarnoff
@@ -226,7 +228,7 @@ class VDM(PairMetric):
 
     def scheduled(self, test: Tensor, reference: Tensor) -> Schedule:
         """Return how a pair, (B, 3, H, W) twice, is computed; `repr` shows it."""
-        return self.schedule or chosen(self._job(test, reference))
+        return self.schedule or super().scheduled(test, reference)
 
     @property
     def _schedule(self) -> Schedule:
@@ -265,6 +267,11 @@ class VDM(PairMetric):
         if schedule.pieces == "strips" and strips.can_be_cut(test):
             return strips.accumulated(model, schedule, test, reference)
         return whole.accumulated(model, schedule, test, reference)
+
+    def _finite_in_both(self, test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        by_kernel = self.schedule is not None and self.schedule.kernel and is_plain()
+        found = kernel_of_mask.finite_in_both if by_kernel else super()._finite_in_both
+        return found(test, reference)
 
     @property
     def _stackable(self) -> bool:

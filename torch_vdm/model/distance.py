@@ -131,7 +131,7 @@ def accumulate(
     return total
 
 
-def just_noticeable(total: Tensor, exponent: Tensor) -> Tensor:
+def just_noticeable(total: Tensor, exponent: Tensor | float) -> Tensor:
     """Return the root of accumulated differences, in JND.
 
     Its infinite slope at 0 is replaced by 0. The slope of the power is 0 there as well, so the

@@ -16,17 +16,16 @@ from torch import Tensor
 from torch.nn import functional
 
 from torch_vdm.effects import Effects
-from torch_vdm.model import filtering
+from torch_vdm.model import filtering, lowpass
 from torch_vdm.model.aberration import attenuation
 from torch_vdm.model.charging import Charge, changes, charge
 from torch_vdm.model.cones import of_grey, pixels_to_cones
-from torch_vdm.model.contrast import opponents, weber_contrast
 from torch_vdm.model.cortex import Cortex, Transform
 from torch_vdm.model.cortex.haar import lowpass_of_light
 from torch_vdm.model.cortex.transform import DEEPEST, Base, mean_of
 from torch_vdm.model.csf import barten, butterworth
 from torch_vdm.model.display import Display, linear_values
-from torch_vdm.model.distance import LARGEST_DIFFERENCE, Paths, accumulate
+from torch_vdm.model.distance import Paths, accumulate
 from torch_vdm.model.grid import Before, Grid
 from torch_vdm.model.level import (
     OF_LUMINANCE,
@@ -55,6 +54,8 @@ class Derived(NamedTuple):
     """What all levels respond to, the coarsest first."""
     to_cones: Tensor
     """(3, 3), from linear values to cones."""
+    bands: filtering.Weights | None
+    """What filters the images, where they are filtered."""
 
 
 class Model:
@@ -163,6 +164,8 @@ class Model:
 
     def band_weights(self) -> filtering.Weights:
         """Return the weights of the bands of an image that is filtered."""
+        if self.derived is not None and self.derived.bands is not None:
+            return self.derived.bands
         frequency = self.constants["band_frequencies"]
         bright = self._bright(frequency[None], torch.ones_like(frequency)[None])[0]
         passed = self._passed(frequency)
@@ -236,19 +239,21 @@ class Model:
         It is (B, channels, 1, 1), not negative, 1 at threshold; and 0 for an observer that never
         compares them. A uniform change is seen here and nowhere else.
         """
-        one, other = self.cones(first.mean), self.cones(second.mean)
+        means = self.cones(first.mean), self.cones(second.mean)
         if self.observer.lowpass_gains is None:
-            # Part of the autograd graph, so that an image of one pixel has a gradient.
-            return 0.0 * one[:, :1] + 0.0 * other[:, :1]
-        contrast = weber_contrast(one, other, self.constants["dark_cones"])
-        gains = self.constants["lowpass_gains"].view(-1, 1, 1)
-        weighted = opponents(contrast, self.constants["opponents"]) * gains
-        return weighted.abs().clamp_max(LARGEST_DIFFERENCE)
+            return _nothing(*means)
+        constants = (self.constants[name] for name in ("dark_cones", "opponents", "lowpass_gains"))
+        return lowpass.lowpass_difference(*means, *constants)
 
     def root(self, first: Cortex, second: Cortex) -> Tensor:
         """Return the value that every path starts from, (B, 1, 1, 1)."""
-        seen = self.lowpass_difference(first, second) ** self.constants["summation_exponent"]
-        return seen.sum(1, keepdim=True)
+        means = self.cones(first.mean), self.cones(second.mean)
+        if self.observer.lowpass_gains is None:
+            return _nothing(*means)
+        names = "dark_cones", "opponents", "lowpass_gains", "summation_exponent"
+        constants = (self.constants[name] for name in names)
+        found: Tensor = self.steps.once(lowpass.root, *means, *constants)
+        return found
 
     def changes(self, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
         """Return the `charging.changes` of every level, level 0 first; none without charging."""
@@ -298,7 +303,8 @@ class Model:
 
     def derive(self) -> Derived:
         """Return what follows from the constants alone."""
-        return Derived(self.all_levels(), self._to_cones())
+        bands = self.band_weights() if self.transform.csf == "filter" else None
+        return Derived(self.all_levels(), self._to_cones(), bands)
 
     # What a level depends on.
 
@@ -376,6 +382,12 @@ class Model:
                 for name in ("red_green", "yellow_violet")
             ]
         return torch.stack(channels, 1) / gain.unsqueeze(1) if channels else gain.unsqueeze(1)
+
+
+def _nothing(first: Tensor, second: Tensor) -> Tensor:
+    """Return 0 for every item: no difference between two means (B, C, 1, 1)."""
+    # Part of the autograd graph, so that an image of one pixel has a gradient.
+    return 0.0 * first[:, :1] + 0.0 * second[:, :1]
 
 
 def weights_alone(level: Level) -> Sight:

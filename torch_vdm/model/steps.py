@@ -21,12 +21,30 @@ class Steps:
         """Return what a pure function of planes returns; its first plane says how large it is."""
         return function(*arguments)
 
+    def once(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return what a pure function returns whose operations take longer to call than to run.
+
+        That is so of a few numbers, and on a GPU of most planes.
+        """
+        return function(*arguments)
+
     def valid(self, function: Callable[..., Any], around: Tensor, *arguments: Any) -> Any:
         """Return what a pure function returns of planes that come with their neighbours.
 
         Its planes are smaller by these, as those of a convolution that is called valid.
         """
         return function(around, *arguments)
+
+    def padded(
+        self,
+        function: Callable[..., Any],
+        pad: Callable[[Tensor, Any], Tensor],
+        planes: Tensor,
+        sides: Any,
+        *arguments: Any,
+    ) -> Any:
+        """Return what a step returns of planes that ``pad`` has padded before."""
+        return self(function, pad(planes, sides), *arguments)
 
     def pixels(self, function: Callable[..., Tensor], *planes: Tensor) -> Tensor:
         """Return the value of a pointwise function of pixels."""

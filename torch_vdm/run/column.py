@@ -30,14 +30,9 @@ class Column(NamedTuple):
     parent: Tensor
     """(N, 1): where each node's parent lies in a column of the planes of parents."""
 
-    def of(self, planes: Sequence[Tensor]) -> Tensor:
-        """Return planes (..., h, w) of all levels, or of the first ones, in a column."""
-        return torch.cat([plane.flatten(-2).unsqueeze(-1) for plane in planes], -2)
-
     def planes(self, column: Tensor) -> list[Tensor]:
         """Return the planes (..., h, w) of all levels in a column."""
-        parts = column.squeeze(-1).split([math.prod(size) for size in self.sizes], -1)
-        return [part.unflatten(-1, size) for part, size in zip(parts, self.sizes, strict=True)]
+        return apart(column, self.sizes)
 
     def of_parents(self, column: Tensor) -> Tensor:
         """Return a column in which every node has the value of its parent in another."""
@@ -62,6 +57,17 @@ class Cells(NamedTuple):
         return at(valid, self.places)
 
 
+def joined(planes: Sequence[Tensor]) -> Tensor:
+    """Return planes (..., h, w) of levels in a column."""
+    return torch.cat([plane.flatten(-2).unsqueeze(-1) for plane in planes], -2)
+
+
+def apart(column: Tensor, sizes: Sizes) -> list[Tensor]:
+    """Return the planes (..., h, w) of levels in a column."""
+    parts = column.squeeze(-1).split([math.prod(size) for size in sizes], -1)
+    return [part.unflatten(-1, size) for part, size in zip(parts, sizes, strict=True)]
+
+
 def at(plane: Tensor, places: Tensor) -> Tensor:
     """Return the values (..., h, w) of a column, or of a plane row by row, at places (h, w)."""
     # Selecting from two dimensions is much faster than from more.
@@ -78,17 +84,17 @@ def column_of(
     ``parents``: the sizes of the planes that hold these, those of the levels by default; the first
     is that of level 0, and of level 1.
     """
-    column: Column = _kept_for(like)(_column, sizes, tuple(before), like.device, parents or sizes)
+    column: Column = kept_for(like)(_column, sizes, tuple(before), like.device, parents or sizes)
     return column
 
 
 def cells_of(sizes: Sizes, ring: tuple[int, int], like: Tensor) -> Cells:
     """Return the cells of levels, with so many nodes before and after each, in y and in x."""
-    cells: Cells = _kept_for(like)(_cells, sizes, ring, like.device)
+    cells: Cells = kept_for(like)(_cells, sizes, ring, like.device)
     return cells
 
 
-def _kept_for(like: Tensor) -> Callable[..., Any]:
+def kept_for(like: Tensor) -> Callable[..., Any]:
     """Return what calls a function, and keeps the result if that can be used in other calls."""
     if type(like) is Tensor and not torch.compiler.is_compiling():
         return _kept

@@ -86,18 +86,26 @@ class Schedule(Steps):
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return what a step returns, using its compiled form where that pays."""
+        if self._has_kernel(function):
+            return BY_KERNEL[function](*arguments)
         first = _first(arguments)
-        if self._has_kernel(function) or not self._compiles(first):
+        if not self._compiles(first):
             return self.form(function, first)(*arguments)
         items = first.shape[0]
         if not self.stacked or items == 1:
             return compiled(function)(*arguments)
         return apart(compiled(function)(*below(arguments, items)), items)
 
+    def once(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return what a pure function returns, on a GPU by as few operations as possible."""
+        if not self.compiled or self.cached:
+            return function(*arguments)
+        # A user's image, or half of a batch, may be a part of another.
+        whole = (_unviewed(each) if isinstance(each, Tensor) else each for each in arguments)
+        return compiled(function)(*whole)
+
     def form(self, function: Callable[..., Any], first: Tensor) -> Callable[..., Any]:
         """Return what gives the same as a step, uncompiled, if its first plane is ``first``."""
-        if self._has_kernel(function):
-            return BY_KERNEL[function]
         return BY_HAND.get(function, function) if first.requires_grad and by_hand() else function
 
     def valid(self, function: Callable[..., Any], around: Tensor, *arguments: Any) -> Any:
@@ -107,6 +115,19 @@ class Schedule(Steps):
             return self(function, around, *arguments)
         found = compiled(function)(*below((around, *arguments), items))
         return apart(found, items, rows_lost(around, found, items))
+
+    def padded(
+        self,
+        function: Callable[..., Any],
+        pad: Callable[[Tensor, Any], Tensor],
+        planes: Tensor,
+        sides: Any,
+        *arguments: Any,
+    ) -> Any:
+        """Return what a step returns of planes that are padded before; a kernel pads by itself."""
+        if self._has_kernel(function):
+            return BY_KERNEL[function](planes, sides, *arguments)
+        return super().padded(function, pad, planes, sides, *arguments)
 
     def _has_kernel(self, function: Callable[..., Any]) -> bool:
         """Return whether a step is computed by a kernel."""
@@ -127,8 +148,7 @@ class Schedule(Steps):
         """Return the value of a pointwise function of pixels, a few rows at a time."""
         if self.compiled:
             # A user's image may be a part of another.
-            whole = (plane.clone() if plane.storage_offset() else plane for plane in planes)
-            return function(*(unviewed(plane, plane.shape) for plane in whole))
+            return function(*map(_unviewed, planes))
         if not self.cached:
             found: Tensor = self.part(function, *planes)
             return found
@@ -203,3 +223,8 @@ def _first(arguments: tuple[Any, ...]) -> Tensor:
     first = arguments[0]
     plane: Tensor = first if isinstance(first, Tensor) else first[0]
     return plane
+
+
+def _unviewed(plane: Tensor) -> Tensor:
+    """Return a plane that is not a view, and begins where its memory does."""
+    return unviewed(plane.clone() if plane.storage_offset() else plane, plane.shape)

@@ -22,10 +22,11 @@ from torch_vdm.model.level import (
 )
 from torch_vdm.model.model import Model, weights_alone
 from torch_vdm.run import schedule as limits
-from torch_vdm.run.column import Column, cells_of, column_of
-from torch_vdm.run.gradients import by_hand
+from torch_vdm.run.column import Cells, Column, cells_of, column_of, joined
+from torch_vdm.run.gradients import by_hand, is_plain
 from torch_vdm.run.gradients.level import local_difference_by_hand
-from torch_vdm.run.kernels import level as kernel
+from torch_vdm.run.kernels import descent as kernel_of_descent
+from torch_vdm.run.kernels import level as kernel_of_levels
 from torch_vdm.run.schedule import Schedule
 
 
@@ -45,6 +46,9 @@ def compared(model: Model, schedule: Schedule, first: Cortex, second: Cortex) ->
 
 def descended(model: Model, schedule: Schedule, paths: Paths, before: Sequence[Before]) -> Tensor:
     """Return `Model.descended`, computing what the coarsest levels are charged at once."""
+    if schedule.kernel and model.observer.charging and paths.local and is_plain():
+        _, charge = _charged(model, schedule, paths.changes, before)
+        return kernel_of_descent.accumulated(paths, charge, before)
     charges = _charges(model, schedule, paths.changes, before) if model.observer.charging else None
     down = schedule.form(passed_down, paths.root)
     return accumulate(paths.local, paths.root, before, charges, down)
@@ -61,8 +65,8 @@ def local_differences(
 ) -> tuple[Tensor, ...]:
     """Return `Model.local_differences`, dropping the responses of a level once they are used."""
     levels = model.levels(first.finest, len(first.details))
-    if schedule.kernel and kernel.is_usable(model):
-        return kernel.local_differences(model, first, second, levels)
+    if schedule.kernel and kernel_of_levels.is_usable(model):
+        return kernel_of_levels.local_differences(model, first, second, levels)
     few = _few(schedule, first.details)
     return (
         *_of_few(model, schedule, first, second, few, levels),
@@ -77,8 +81,8 @@ def level_difference(
     model: Model, schedule: Schedule, first: Cortex, second: Cortex, number: int, level: Level
 ) -> Tensor:
     """Return `Model.local_difference` of a level."""
-    if schedule.kernel and kernel.is_usable(model):
-        return kernel.local_difference(model, first, second, number, level)
+    if schedule.kernel and kernel_of_levels.is_usable(model):
+        return kernel_of_levels.local_difference(model, first, second, number, level)
     details, others = first.details[number], second.details[number]
     options = model.options()
     sights = model.sights(level, (first, second), number)
@@ -128,7 +132,7 @@ def _of_few(
         return []
     options = model.options()
     column = _column(first.details[:few], first.before, first.windows or first.lowpass)
-    details = [column.of(cortex.details[:few]) for cortex in (first, second)]
+    details = [joined(cortex.details[:few]) for cortex in (first, second)]
     level = levels.in_a_column(column.level)
     difference = _column_difference(model, schedule, (first, second), column, details, level)
     cells = cells_of(column.sizes, options.ring, difference)
@@ -154,7 +158,7 @@ def _column_difference(
     above = [(cortex.windows or cortex.lowpass)[:most] for cortex in images]
     # Images that are compared at the same light share it, and what follows from it.
     one = all(plane is other for plane, other in zip(*above, strict=True))
-    parents = [column.of_parents(column.of(planes)) for planes in above[: 1 if one else 2]]
+    parents = [column.of_parents(joined(planes)) for planes in above[: 1 if one else 2]]
     seen_at = parents, level, *model.sight_options()
     difference: Tensor = schedule(response_difference_at, *details, seen_at, options)
     return difference
@@ -178,14 +182,28 @@ def _charges(
     few = _few(schedule, changes)
     coarse: list[Charge] = []
     if few:
-        column = _column(changes[:few], before)
-        shifts, filtered = model.transform.shifts, model.transform.csf == "filter"
-        cells = cells_of(column.sizes, (AROUND * shifts, AROUND * shifts), changes[0])
-        around = cells.of(column.of(changes[:few]))
-        inherited, own = charge_within(around, shifts, filtered, schedule.cached)
-        owns = [None] * few if own is None else column.planes(cells.column(own))
-        coarse = list(map(Charge, column.planes(cells.column(inherited)), owns))
+        column, (inherited, own) = _charged(model, schedule, changes[:few], before)
+        owns = [None] * few if own is None else column.planes(own)
+        coarse = list(map(Charge, column.planes(inherited), owns))
     return coarse + (model.charges(changes[few:]) or [])
+
+
+def _charged(
+    model: Model, schedule: Schedule, changes: Sequence[Tensor], before: Sequence[Before]
+) -> tuple[Column, Charge]:
+    """Return `Model.charges` of levels, the coarsest first, in columns."""
+    column = _column(changes, before)
+    shifts, filtered = model.transform.shifts, model.transform.csf == "filter"
+    cells = cells_of(column.sizes, (AROUND * shifts, AROUND * shifts), changes[0])
+    options = shifts, filtered, schedule.cached
+    charge: Charge = schedule.once(_charge, joined(changes), cells, *options)
+    return column, charge
+
+
+def _charge(column: Tensor, cells: Cells, shifts: int, filtered: bool, cached: bool) -> Charge:
+    """Return `charge_within` of levels in a column, in columns."""
+    inherited, own = charge_within(cells.of(column), shifts, filtered, cached)
+    return Charge(cells.column(inherited), None if own is None else cells.column(own))
 
 
 def _changes(model: Model, schedule: Schedule, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
@@ -196,8 +214,8 @@ def _changes(model: Model, schedule: Schedule, first: Cortex, second: Cortex) ->
     coarse: list[Tensor] = []
     if few:
         column = _column(first.lowpass[:few], first.before)
-        changed = changes(*(column.of(cortex.lowpass[:few]) for cortex in (first, second)))
-        coarse = column.planes(changed)
+        lowpass = (joined(cortex.lowpass[:few]) for cortex in (first, second))
+        coarse = column.planes(schedule.once(changes, *lowpass))
     fine = range(few, len(first.details))
     return (*coarse, *(model.change(first, second, number) for number in fine))
 

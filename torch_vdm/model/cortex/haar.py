@@ -81,7 +81,8 @@ class Haar:
             ``details[l]`` is (B, C, 3, h, w): d1 (horizontal), d2 (vertical), d3 (diagonal).
         """
         size = (planes.shape[-2], planes.shape[-1])
-        return self.coarser(Base(planes, 0, size, mean_of(planes)), steps, true_means, grid=grid)
+        base = Base(planes, 0, size, steps.once(mean_of, planes))
+        return self.coarser(base, steps, true_means, grid=grid)
 
     def begin(
         self,
@@ -235,8 +236,8 @@ def _descended(
         if not true_means or (not steps.fused and all(map(is_inside, sides, nodes))):
             planes, *details = steps(inside, pad_even(planes))
         else:
-            even = with_siblings(planes, sides)
-            planes, *details = steps(at_border, even, *weights(sides, nodes, planes))
+            of = weights(sides, nodes, planes)
+            planes, *details = steps.padded(at_border, with_siblings, planes, sides, *of)
         found.append((planes, *details))
     return found
 

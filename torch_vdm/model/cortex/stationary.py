@@ -76,7 +76,7 @@ class StationaryHaar:
             (y, x) begins at the pixel (2^k y, 2^k x), or 2^(k - 1) after it.
         """
         size = (planes.shape[-2], planes.shape[-1])
-        mean = mean_of(planes)
+        mean = steps.once(mean_of, planes)
         means = lowpasses(planes, 0, size, true_means)
         # The means of nodes of 1, 1, 2, 4 ... pixels: halves of the finest, quarters of all others.
         parts = [planes, planes, *means][: len(means)]

@@ -92,7 +92,7 @@ class Steerable:
             response, each 1 at a level's best frequency for a grating of amplitude 1. Sizes are
             those of `StationaryHaar`.
         """
-        mean = mean_of(planes)
+        mean = steps.once(mean_of, planes)
         band = _doubled(_doubled(planes, -1), -2)
         return self._cortex(planes, band - blur(band, steps), 0, mean, steps)
 

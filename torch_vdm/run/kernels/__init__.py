@@ -1,9 +1,9 @@
 """Parts of the model as kernels of Triton, forward and backward, for GPUs.
 
-A step of `Haar`, a level's local visual difference and a step down the quad-tree are one launch
-each, and one, two and one for their gradients, where the model's steps are many operations, each of
-which a GPU waits for. On a processor only Triton's interpreter runs kernels, for tests: it does so
-where TRITON_INTERPRET=1 was set before they are first used.
+A step of `Haar`, the local visual differences of all levels, the way down the quad-tree and the
+mask of pixels that are not finite are one launch each, where the model's steps are many operations,
+each of which a GPU waits for. On a processor only Triton's interpreter runs kernels, for tests: it
+does so where TRITON_INTERPRET=1 was set before they are first used.
 """
 
 from collections.abc import Sequence
@@ -56,17 +56,22 @@ def of(module: str, device: torch.device) -> Any:
     return kernels
 
 
+def programs(nodes: int, block: int) -> int:
+    """Return how many programs have so many nodes, a block each."""
+    return -(-nodes // block)
+
+
 def launch(
     kernel: Any,
-    nodes: int,
+    count: int,
     items: int,
     planes: Sequence[Tensor],
     sizes: Sequence[int],
+    block: int | None = None,
     **constants: bool,
 ) -> None:
-    """Launch a kernel with a program for each block of ``nodes`` of each of so many ``items``."""
+    """Launch a kernel with ``count`` programs for each of so many ``items``; ``block``: `BLOCK`."""
+    # A difference of two products is not fused, for it must be 0 where both are equal.
+    options = {**constants, "block": block or BLOCK, "enable_fp_fusion": False}
     with torch.cuda.device_of(planes[0]):
-        # A difference of two products is not fused, for it must be 0 where both are equal.
-        kernel[-(-nodes // BLOCK), items](
-            *planes, *sizes, **constants, block=BLOCK, enable_fp_fusion=False
-        )
+        kernel[count, items](*planes, *sizes, **options)

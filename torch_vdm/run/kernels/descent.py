@@ -1,45 +1,80 @@
-"""A step down the quad-tree by a kernel of Triton, and its gradient by another."""
+"""The way down the quad-tree by one kernel of Triton, and its gradient by one for each level."""
 
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torch_vdm.model.charging import Charge
+from torch_vdm.model.distance import Paths, accumulate
 from torch_vdm.model.grid import Before
 from torch_vdm.run import kernels
-from torch_vdm.run.gradients.descent import gradients_of_passed_down, passed_down_by
+from torch_vdm.run.column import apart, joined
+from torch_vdm.run.kernels.table import Table, table_of
 
 
-class _PassedDown(torch.autograd.Function):
+def accumulated(paths: Paths, charge: Charge, before: Sequence[Before]) -> Tensor:
+    """Return `accumulate` of differences, with the shares of all levels in a column."""
+    sizes = tuple((plane.shape[-2], plane.shape[-1]) for plane in paths.local)
+    table = table_of(sizes, (sizes[0], *sizes[:-1]), before, paths.root)
+
+    def plain(local: Tensor, inherited: Tensor, root: Tensor) -> Tensor:
+        shares = [Charge(share, None) for share in apart(inherited, sizes)]
+        return accumulate(apart(local, sizes), root, before, shares)
+
+    columns = joined(paths.local), charge.inherited.contiguous()
+    found: Tensor = _Accumulated.apply(plain, table, *columns, paths.root)
+    return found
+
+
+class _Accumulated(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, nodes: Tensor, total: Tensor, inherited: Tensor, before: Before
+        ctx: Any,
+        plain: Callable[..., Tensor],
+        table: Table,
+        local: Tensor,
+        inherited: Tensor,
+        root: Tensor,
     ) -> Tensor:
-        total, inherited = total.contiguous(), inherited.contiguous()
-        ctx.save_for_backward(total, inherited)
-        ctx.before = before
-        passed = torch.empty_like(inherited)
-        _launch("descent", (nodes.contiguous(), total, inherited, passed), before)
-        return passed
+        total = torch.empty_like(local)
+        leaves = local.new_empty(*local.shape[:2], *table.sizes[-1])
+        planes = local, inherited, root.contiguous(), table.rows, total, leaves
+        sizes = len(table.sizes), table.nodes
+        kernel = kernels.of("triton_descent", local.device).descent
+        kernels.launch(kernel, table.programs, len(local), planes, sizes)
+        ctx.plain, ctx.table = plain, table
+        ctx.save_for_backward(local, inherited, root, total)
+        return leaves
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        total, inherited = ctx.saved_tensors
+        local, inherited, root, total = ctx.saved_tensors
+        wanted: tuple[bool, ...] = ctx.needs_input_grad[2:]
         if torch.is_grad_enabled():
-            return gradients_of_passed_down(gradient, total, inherited, ctx.before)
-        by_total, by_inherited = torch.empty_like(total), torch.empty_like(inherited)
-        planes = gradient.contiguous(), total, inherited, by_total, by_inherited
-        _launch("ascent", planes, ctx.before)
-        return gradient, by_total, by_inherited, None
+            # It will be differentiated again, so this is left to autograd.
+            planes = [plane.view_as(plane) for plane in (local, inherited, root)]
+            inputs = [plane for plane, want in zip(planes, wanted, strict=True) if want]
+            each = iter(
+                torch.autograd.grad(ctx.plain(*planes), inputs, gradient, create_graph=True)
+            )
+            return None, None, *(next(each) if want else None for want in wanted)
+        return None, None, *_gradients(gradient, local, inherited, root, total, ctx.table)
 
 
-def _launch(name: str, planes: tuple[Tensor, ...], before: Before) -> None:
-    """Launch a kernel with a program for each block of nodes, or of parents, of each item."""
-    nodes, parents = planes[0], planes[1]
-    kernel = getattr(kernels.of("triton_descent", nodes.device), name)
-    written = nodes if name == "descent" else parents
-    sizes = *nodes.shape[-2:], *parents.shape[-2:], *before
-    kernels.launch(kernel, written[0].numel(), len(nodes), planes, sizes)
-
-
-passed_down_by_kernel = passed_down_by(_PassedDown)
+def _gradients(
+    gradient: Tensor, local: Tensor, inherited: Tensor, root: Tensor, total: Tensor, table: Table
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the gradients by local differences, shares and the root."""
+    by_local, by_inherited = torch.empty_like(local), torch.empty_like(inherited)
+    by_root = torch.empty_like(root, memory_format=torch.contiguous_format)
+    apart(by_local, table.sizes)[-1].copy_(gradient)
+    kernel = kernels.of("triton_descent", local.device).ascent
+    planes = by_local, total, inherited, root.contiguous(), table.rows, by_inherited, by_root
+    for number in reversed(range(len(table.sizes))):
+        parents = math.prod(table.sizes[max(number - 1, 0)])
+        count = kernels.programs(parents, kernels.BLOCK)
+        kernels.launch(kernel, count, len(local), planes, (table.nodes, number))
+    return by_local, by_inherited, by_root

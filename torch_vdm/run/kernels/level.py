@@ -1,4 +1,4 @@
-"""A level's local visual difference by a kernel of Triton, and its gradient by two."""
+"""Levels' local visual differences by one kernel of Triton, and their gradients by two."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -7,12 +7,13 @@ import torch
 from torch import Tensor
 
 from torch_vdm.model.cortex import Cortex
-from torch_vdm.model.grid import Before
 from torch_vdm.model.level import Level, Levels, sights_of
 from torch_vdm.model.level import local_difference as level_difference
 from torch_vdm.model.model import Model
 from torch_vdm.run import kernels
+from torch_vdm.run.column import apart, joined
 from torch_vdm.run.gradients import is_plain
+from torch_vdm.run.kernels.table import Table, table_of
 
 
 def is_usable(model: Model) -> bool:
@@ -27,56 +28,61 @@ def is_usable(model: Model) -> bool:
 def local_differences(
     model: Model, first: Cortex, second: Cortex, levels: Levels
 ) -> tuple[Tensor, ...]:
-    """Return `Model.local_differences`, one launch for each level.
+    """Return `Model.local_differences`, in one launch.
 
     Raises
     ------
     ValueError
         If the images are where Triton cannot run.
     """
-    module = kernels.of("triton_level", first.mean.device)
-    numbers = module.numbers_of(levels, model.constants)
-    return tuple(
-        _of_level(module, model, first, second, number, numbers[number], levels.only)
-        for number in range(len(first.details))
-    )
+    numbers = range(len(first.details))
+    return _of_levels(model, first, second, numbers, levels, levels.only)
 
 
 def local_difference(
     model: Model, first: Cortex, second: Cortex, number: int, level: Level
 ) -> Tensor:
     """Return `Model.local_difference` of a level, likewise."""
-    module = kernels.of("triton_level", first.mean.device)
-    numbers = module.numbers_of([part.flatten().unsqueeze(0) for part in level], model.constants)
-    return _of_level(module, model, first, second, number, numbers[0], lambda _: level)
+    parts = [part.flatten().unsqueeze(0) for part in level]
+    (local,) = _of_levels(model, first, second, [number], parts, lambda _: level)
+    return local
 
 
-def _of_level(
-    module: Any,
+def _of_levels(
     model: Model,
     first: Cortex,
     second: Cortex,
-    number: int,
-    numbers: Tensor,
+    numbers: Sequence[int],
+    parts: Sequence[Tensor],
     level_of: Callable[[int], Level],
-) -> Tensor:
-    before = first.before[number]
+) -> tuple[Tensor, ...]:
+    """Return the local visual differences of the levels of these ``numbers``.
 
-    def plain(details: Tensor, others: Tensor, parent: Tensor, other: Tensor) -> Tensor:
-        size = details.shape[-2], details.shape[-1]
-        sights = sights_of((parent, other), level_of(number), *model.sight_options())
-        one, two = (sight.pushed(size, before=before) for sight in sights)
-        return level_difference(details, others, one, two, model.options())
+    ``parts`` are those of their `Levels`; ``level_of`` returns those of one number.
+    """
+    if not numbers:
+        return ()
+    module = kernels.of("triton_level", first.mean.device)
+    before = [first.before[number] for number in numbers]
+    details = [[cortex.details[number] for number in numbers] for cortex in (first, second)]
+    parents = [[cortex.parent_lowpass(number) for number in numbers] for cortex in (first, second)]
+    sizes, above = (tuple(map(_size, planes)) for planes in (details[0], parents[0]))
+    table = table_of(sizes, above, before, first.mean)
 
-    images = (
-        first.details[number],
-        second.details[number],
-        first.parent_lowpass(number),
-        second.parent_lowpass(number),
-    )
-    planes = (plane.contiguous() for plane in images)
-    local: Tensor = _LocalDifference.apply(plain, module, numbers, before, *planes)
-    return local
+    def plain(*columns: Tensor) -> Tensor:
+        of_sizes = zip(columns, (sizes, sizes, above, above), strict=True)
+        planes = zip(numbers, before, *(apart(*each) for each in of_sizes), strict=True)
+        local = []
+        for number, put_before, details, others, parent, other in planes:
+            sights = sights_of((parent, other), level_of(number), *model.sight_options())
+            one, two = (sight.pushed(_size(details), put_before) for sight in sights)
+            local.append(level_difference(details, others, one, two, model.options()))
+        return joined(local)
+
+    of_levels = module.numbers_of(parts, model.constants)
+    images = map(joined, (*details, *parents))
+    local: Tensor = _LocalDifference.apply(plain, module, of_levels, table, *images)
+    return tuple(apart(local, sizes))
 
 
 class _LocalDifference(torch.autograd.Function):
@@ -86,14 +92,14 @@ class _LocalDifference(torch.autograd.Function):
         plain: Callable[..., Tensor],
         module: Any,
         numbers: Tensor,
-        before: Before,
+        table: Table,
         *images: Tensor,
     ) -> Tensor:
-        ctx.plain, ctx.module, ctx.before = plain, module, before
+        ctx.plain, ctx.module, ctx.table = plain, module, table
         ctx.save_for_backward(numbers, *images)
         local = torch.empty_like(images[0][:, :1, 0])
-        nodes = local.shape[-2] * local.shape[-1]
-        _launch(module.local_difference, nodes, (*images, numbers, local), images, before)
+        planes = *images, numbers, table.rows, local
+        _launch(module.local_difference, table.programs, planes, table)
         return local
 
     @staticmethod
@@ -108,7 +114,7 @@ class _LocalDifference(torch.autograd.Function):
             each = iter(found)
             slopes = [next(each) if want else None for want in wanted]
         else:
-            slopes = _gradients(ctx.module, gradient, numbers, images, ctx.before, wanted)
+            slopes = _gradients(ctx.module, gradient, numbers, images, ctx.table, wanted)
         return None, None, None, None, *slopes
 
 
@@ -117,35 +123,35 @@ def _gradients(
     gradient: Tensor,
     numbers: Tensor,
     images: Sequence[Tensor],
-    before: Before,
+    table: Table,
     wanted: Sequence[bool],
 ) -> list[Tensor | None]:
     """Return the gradients by those of the ``images`` that are ``wanted``."""
-    details, _, parents, _ = images
-    items, *_, height, width = details.shape
-    slope = details.new_empty(items, 12, height, width)
-    arguments = gradient.contiguous(), *images, numbers, slope
-    _launch(module.slopes, height * width, arguments, images, before)
+    slope = gradient.new_empty(len(gradient), 12, table.nodes)
+    planes = gradient.contiguous(), *images, numbers, table.rows, slope
+    _launch(module.slopes, table.programs, planes, table)
     which = {"first": wanted[0] or wanted[2], "second": wanted[1] or wanted[3]}
     # What is not wanted is not written.
     found = [
         torch.empty_like(image) if want else image
         for image, want in zip(images, 2 * list(which.values()), strict=True)
     ]
-    arguments = slope, *images, numbers, *found
-    nodes = parents.shape[-2] * parents.shape[-1]
-    _launch(module.gradients, nodes, arguments, images, before, **which)
+    planes = slope, *images, numbers, table.rows, *found
+    _launch(module.gradients, table.programs_of_parents, planes, table, **which)
     return [plane if want else None for plane, want in zip(found, wanted, strict=True)]
 
 
 def _launch(
     kernel: Any,
-    nodes: int,
-    arguments: Sequence[Tensor],
-    images: Sequence[Tensor],
-    before: Before,
+    programs: int,
+    planes: Sequence[Tensor],
+    table: Table,
     **constants: bool,
 ) -> None:
-    """Launch a kernel with a program for each block of ``nodes`` of each item."""
-    sizes = *images[0].shape[-2:], *images[2].shape[-2:], *before
-    kernels.launch(kernel, nodes, len(images[0]), arguments, sizes, **constants)
+    """Launch a kernel for the levels of all items."""
+    sizes = len(table.sizes), table.nodes, table.parents
+    kernels.launch(kernel, programs, len(planes[0]), planes, sizes, **constants)
+
+
+def _size(plane: Tensor) -> tuple[int, int]:
+    return plane.shape[-2], plane.shape[-1]

@@ -5,13 +5,11 @@ from typing import Any
 
 from torch_vdm.model.cortex.border import analyse_at_border
 from torch_vdm.model.cortex.haar import analyse
-from torch_vdm.model.distance import passed_down
-from torch_vdm.run.kernels.descent import passed_down_by_kernel
 from torch_vdm.run.kernels.haar import analysed, analysed_at_border
 
-# What gives the same as a step of the model, by a kernel.
+# What gives the same as a step of the model, by a kernel; of `analyse_at_border` as `Steps.padded`
+# calls it, with planes that are not padded yet.
 STEPS: dict[Callable[..., Any], Callable[..., Any]] = {
     analyse: analysed,
     analyse_at_border: analysed_at_border,
-    passed_down: passed_down_by_kernel,
 }

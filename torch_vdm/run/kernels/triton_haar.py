@@ -2,71 +2,78 @@
 
 `torch_vdm.run.kernels.haar` launches them; only it imports this, since Triton may not be installed.
 
-A program has a block of nodes of one plane. The planes (N, 2 height, 2 width) have even sides, as
-`analyse` takes them. With ``border``, ``down`` (3, height), ``half`` (height) and ``across``
-(3, width) are the weights of `Down` and `Across`; without, they and ``window`` are not used.
+A program has a block of nodes of one plane, (N, height, width), or of their children, (N, rows,
+columns). ``top`` and ``left``, 0 or 1, are how many children are put before the first: node (y, x)
+has the children 2 y - top and 2 y - top + 1, and so along x, where one beyond the border is its
+neighbour, as in `with_siblings`. With ``border``, ``down`` (3, height), ``half`` (height) and
+``across`` (3, width) are the weights of `Down` and `Across`; without, they and ``window`` are not
+used.
 """
 
 import triton
 from triton import language as tl
 
-SIZES = ("height", "width")
-PLANES = ("even", "lowpass", "details", "window", "down", "half", "across")
+# How many elements one plane begins after the last, of gradients that are parts of others.
+STRIDES = ("of_lowpass", "of_details", "of_window")
+SIZES = ("rows", "columns", "top", "left", "height", "width", *STRIDES)
+PLANES = ("children", "lowpass", "details", "window", "down", "half", "across")
 
 
 @triton.jit
-def _of_node(height, width, block: tl.constexpr):
-    """Return a program's nodes, row, column and plane, and how many nodes a plane has."""
-    node = tl.program_id(0) * block + tl.arange(0, block)
-    return node, node // width, node % width, tl.program_id(1).to(tl.int64), height * width
-
-
-@triton.jit
-def _children(y, x, width):
-    """Return where the four children of a node are: two on its left and right, and those below."""
-    first = 4 * y * width + 2 * x
-    return first, first + 1, first + 2 * width, first + 2 * width + 1
+def _reflected(at, side):
+    """Return which child is at a place, one of the neighbours where that is beyond the border."""
+    last = side - 1
+    return tl.maximum(last - tl.abs(last - tl.abs(at)), 0)
 
 
 @triton.jit(do_not_specialize=SIZES, do_not_specialize_on_alignment=PLANES)
 def analysis(
-    even,
+    children,
     lowpass,
     details,
     window,
     down,
     half,
     across,
+    rows,
+    columns,
+    top,
+    left,
     height,
     width,
     border: tl.constexpr,
     block: tl.constexpr,
 ):
     """Write lowpass (N, height, width), details (N, 3, ...) and, with ``border``, the window."""
-    node, y, x, item, plane = _of_node(height, width, block)
-    inside = node < plane
-    even += 4 * item * plane
-    one, two, three, four = _children(y, x, width)
-    left, right = tl.load(even + one, inside, 0.0), tl.load(even + two, inside, 0.0)
-    left_below, right_below = tl.load(even + three, inside, 0.0), tl.load(even + four, inside, 0.0)
+    node = tl.program_id(0) * block + tl.arange(0, block)
+    y, x, plane = node // width, node % width, height * width
+    item, inside = tl.program_id(1).to(tl.int64), node < plane
+    children += item * rows * columns
+    above = _reflected(2 * y - top, rows) * columns
+    below = _reflected(2 * y - top + 1, rows) * columns
+    before, after = _reflected(2 * x - left, columns), _reflected(2 * x - left + 1, columns)
+    one = tl.load(children + above + before, inside, 0.0)
+    two = tl.load(children + above + after, inside, 0.0)
+    three = tl.load(children + below + before, inside, 0.0)
+    four = tl.load(children + below + after, inside, 0.0)
     if border:
-        upper, lower = left - right, left_below - right_below
+        upper, lower = one - two, three - four
         weight = tl.load(across + x, inside, 0.0)
-        top, bottom = right + weight * upper, right_below + weight * lower
-        mean = bottom + tl.load(down + y, inside, 0.0) * (top - bottom)
+        first, second = two + weight * upper, four + weight * lower
+        mean = second + tl.load(down + y, inside, 0.0) * (first - second)
         completed = tl.load(down + height + y, inside, 0.0)
         weight = tl.load(across + width + x, inside, 0.0)
-        top, bottom = right + weight * upper, right_below + weight * lower
-        tl.store(window + item * plane + node, bottom + completed * (top - bottom), inside)
+        first, second = two + weight * upper, four + weight * lower
+        tl.store(window + item * plane + node, second + completed * (first - second), inside)
         shorter = tl.load(half + y, inside, 0.0)
-        vertical = shorter * (top - bottom)
+        vertical = shorter * (first - second)
         weight = tl.load(across + 2 * width + x, inside, 0.0)
-        top, bottom = weight * upper, weight * lower
-        horizontal, diagonal = bottom + completed * (top - bottom), shorter * (top - bottom)
+        first, second = weight * upper, weight * lower
+        horizontal, diagonal = second + completed * (first - second), shorter * (first - second)
     else:
-        upper, lower = 0.25 * (left + left_below), 0.25 * (right + right_below)
+        upper, lower = 0.25 * (one + three), 0.25 * (two + four)
         mean, horizontal = upper + lower, upper - lower
-        upper, lower = 0.25 * (left - left_below), 0.25 * (right - right_below)
+        upper, lower = 0.25 * (one - three), 0.25 * (two - four)
         vertical, diagonal = upper + lower, upper - lower
     tl.store(lowpass + item * plane + node, mean, inside)
     details += 3 * item * plane + node
@@ -75,9 +82,11 @@ def analysis(
     tl.store(details + 2 * plane, diagonal, inside)
 
 
-@triton.jit(do_not_specialize=SIZES, do_not_specialize_on_alignment=PLANES)
-def synthesis(
-    even,
+@triton.jit
+def _gradient(
+    y,
+    x,
+    inside,
     lowpass,
     details,
     window,
@@ -86,41 +95,109 @@ def synthesis(
     across,
     height,
     width,
+    of_details,
+    border: tl.constexpr,
+):
+    """Return the gradient by the child at a place that may lie beyond the border; 0 if outside."""
+    node, on_bottom, on_right = (y // 2) * width + x // 2, y % 2 == 1, x % 2 == 1
+    mean = tl.load(lowpass + node, inside, 0.0)
+    horizontal = tl.load(details + node, inside, 0.0)
+    vertical = tl.load(details + of_details + node, inside, 0.0)
+    diagonal = tl.load(details + 2 * of_details + node, inside, 0.0)
+    if border:
+        seen = tl.load(window + node, inside, 0.0)
+        y, x = y // 2, x // 2
+        own, completed = tl.load(down + y, inside, 0.0), tl.load(down + height + y, inside, 0.0)
+        shorter = tl.load(half + y, inside, 0.0)
+        # Along y first: the gradients by the mean, by that for the details, and by the details.
+        first = own * mean
+        first_completed = completed * seen + shorter * vertical
+        first_detail = completed * horizontal + shorter * diagonal
+        of_mean = tl.where(on_bottom, mean - first, first)
+        of_completed = tl.where(on_bottom, seen - first_completed, first_completed)
+        of_detail = tl.where(on_bottom, horizontal - first_detail, first_detail)
+        found = tl.load(across + x, inside, 0.0) * of_mean
+        found += tl.load(across + width + x, inside, 0.0) * of_completed
+        found += tl.load(across + 2 * width + x, inside, 0.0) * of_detail
+        found = tl.where(on_right, of_mean + of_completed - found, found)
+    else:
+        means = tl.where(on_right, mean - horizontal, mean + horizontal)
+        differences = tl.where(on_right, vertical - diagonal, vertical + diagonal)
+        found = 0.25 * tl.where(on_bottom, means - differences, means + differences)
+    return found
+
+
+@triton.jit
+def _places(at, side, before, number: tl.constexpr):
+    """Return a place of a child beside its siblings, and whether it is there.
+
+    A child is at its own place, 0, and perhaps once more before the first one, 1, or after the
+    last, 2.
+    """
+    last = side - 1
+    if number == 0:
+        place, there = at + before, at >= 0
+    elif number == 1:
+        place, there = at * 0, at == tl.where(before == 1, tl.minimum(last, 1), -1)
+    else:
+        place, odd = at * 0 + side + before, (side + before) % 2 == 1
+        there = at == tl.where(odd, tl.maximum(last - 1, 0), -1)
+    return place, there
+
+
+@triton.jit(do_not_specialize=SIZES, do_not_specialize_on_alignment=PLANES)
+def synthesis(
+    children,
+    lowpass,
+    details,
+    window,
+    down,
+    half,
+    across,
+    rows,
+    columns,
+    top,
+    left,
+    height,
+    width,
+    of_lowpass,
+    of_details,
+    of_window,
     border: tl.constexpr,
     block: tl.constexpr,
 ):
-    """Write to ``even`` the gradient of `analysis`, from those by what it writes."""
-    node, y, x, item, plane = _of_node(height, width, block)
-    inside = node < plane
-    mean = tl.load(lowpass + item * plane + node, inside, 0.0)
-    details += 3 * item * plane + node
-    horizontal = tl.load(details, inside, 0.0)
-    vertical = tl.load(details + plane, inside, 0.0)
-    diagonal = tl.load(details + 2 * plane, inside, 0.0)
-    even += 4 * item * plane
-    one, two, three, four = _children(y, x, width)
-    if border:
-        seen = tl.load(window + item * plane + node, inside, 0.0)
-        completed, shorter = tl.load(down + height + y, inside, 0.0), tl.load(half + y, inside, 0.0)
-        top = tl.load(down + y, inside, 0.0) * mean
-        top_completed = completed * seen + shorter * vertical
-        top_detail = completed * horizontal + shorter * diagonal
-        own, half_way = tl.load(across + x, inside, 0.0), tl.load(across + width + x, inside, 0.0)
-        detail = tl.load(across + 2 * width + x, inside, 0.0)
-        left = own * top + half_way * top_completed + detail * top_detail
-        tl.store(even + one, left, inside)
-        tl.store(even + two, top + top_completed - left, inside)
-        bottom, bottom_completed = mean - top, seen - top_completed
-        left = own * bottom + half_way * bottom_completed + detail * (horizontal - top_detail)
-        tl.store(even + three, left, inside)
-        tl.store(even + four, bottom + bottom_completed - left, inside)
-    else:
-        upper, lower = 0.25 * (mean + horizontal), 0.25 * (mean - horizontal)
-        plus, minus = 0.25 * (vertical + diagonal), 0.25 * (vertical - diagonal)
-        tl.store(even + one, upper + plus, inside)
-        tl.store(even + two, lower + minus, inside)
-        tl.store(even + three, upper - plus, inside)
-        tl.store(even + four, lower - minus, inside)
+    """Write the gradient by ``children`` of `analysis`, from those by what it writes.
+
+    These are planes of whole rows that begin ``of_lowpass``, ``of_details`` and ``of_window``
+    elements after one another.
+    """
+    child = tl.program_id(0) * block + tl.arange(0, block)
+    y, x, item = child // columns, child % columns, tl.program_id(1).to(tl.int64)
+    inside = child < rows * columns
+    lowpass += item * of_lowpass
+    details += 3 * item * of_details
+    window += item * of_window
+    total = tl.full(child.shape, 0.0, children.dtype.element_ty)
+    for vertical in tl.static_range(3):
+        row, of_row = _places(y, rows, top, vertical)
+        for horizontal in tl.static_range(3):
+            column, of_column = _places(x, columns, left, horizontal)
+            total += _gradient(
+                row,
+                column,
+                inside & of_row & of_column,
+                lowpass,
+                details,
+                window,
+                down,
+                half,
+                across,
+                height,
+                width,
+                of_details,
+                border,
+            )
+    tl.store(children + item * rows * columns + child, total, inside)
 
 
 # Whether Triton's interpreter runs them, on a processor.

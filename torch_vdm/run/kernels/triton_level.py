@@ -4,11 +4,12 @@ They compute what `torch_vdm.model.level` does from channel weighting to distanc
 signed observer with `Haar`, where the summation exponent is 6. `torch_vdm.run.kernels.level`
 launches them; only it imports this, since Triton may not be installed.
 
-A program has a block of nodes, or of parents, of one item. What a node needs of its neighbours is
-computed again for each node, so that nothing is written in between. Planes are contiguous: details
-(B, 3, 3, h, w), of cones and orientations, and parents (B, 3, above, across), the lowpass that the
-eye is adapted to. The parent of node (y, x) is ((y + top) // 2, (x + left) // 2). ``numbers`` is
-what `numbers_of` returns. Tuples of nine have three orientations for each cone or channel.
+A program has a block of nodes, or of parents, of one level of one item. What a node needs of its
+neighbours is computed again for each node, so that nothing is written in between. All levels lie in
+one column, as ``table`` says, see `triton_table`: details (B, 3, 3, ``nodes``), of cones and
+orientations, and the parents of each level's nodes (B, 3, ``parents``), the lowpass that the eye is
+adapted to. ``numbers`` is what `numbers_of` returns. Tuples of nine have three orientations for
+each cone or channel.
 """
 
 import math
@@ -21,6 +22,15 @@ from triton import language as tl
 
 from torch_vdm.model import contrast, csf, distance, pooling
 from torch_vdm.model.level import OF_LUMINANCE
+from torch_vdm.run.kernels.triton_table import (
+    FIRST,
+    FIRST_OF_PARENTS,
+    PARENTS_START,
+    START,
+    entry,
+    level_of,
+    sizes_of,
+)
 
 # Where each number begins in what `numbers_of` returns.
 PASSED = tl.constexpr(0)
@@ -50,11 +60,12 @@ LARGEST_ENERGY = tl.constexpr(distance.LARGEST_DIFFERENCE**2)
 SMALLEST_OFFSET = tl.constexpr(csf.SMALLEST_OFFSET)
 POOLED = tl.constexpr(pooling.POOLED)
 # One compiled form serves every size and every view.
-SIZES = ("height", "width", "above", "across", "top", "left")
+SIZES = ("levels", "nodes", "parents")
 PLANES = (
     *("details", "others", "parent", "other", "numbers", "local", "gradient", "slope", "found"),
     *("by_details", "by_others", "by_parent", "by_other"),
 )
+TABLES = ("table",)
 
 LN2 = tl.constexpr(math.log(2.0))
 
@@ -76,8 +87,9 @@ def numbers_of(levels: Iterable[Tensor], constants: Mapping[str, Tensor]) -> Ten
 
 
 @triton.jit
-def _loaded(numbers):
-    """Return the 35 numbers as a tuple."""
+def _loaded(numbers, level):
+    """Return the 35 numbers of a level as a tuple."""
+    numbers += level * (TRANSDUCER_EXPONENT + 1)
     loaded = ()
     for number in tl.static_range(TRANSDUCER_EXPONENT + 1):
         loaded = loaded + (tl.load(numbers + number),)
@@ -190,13 +202,12 @@ def _neighbour(number, y, x, height, width):
 
 
 @triton.jit
-def _of_item(images, sizes):
-    """Return where the planes of a program's item begin, that item, and nodes and parents in it."""
+def _of_program(images, table, level, nodes, parents):
+    """Return where the planes of a program's level and item begin."""
     item = tl.program_id(1).to(tl.int64)
-    plane, parents = sizes[0].to(tl.int64) * sizes[1], sizes[2].to(tl.int64) * sizes[3]
-    details, others = images[0] + 9 * item * plane, images[1] + 9 * item * plane
-    parent, other = images[2] + 3 * item * parents, images[3] + 3 * item * parents
-    return (details, others, parent, other), item, plane, parents
+    details, parent = 9 * item * nodes + entry(table, level, START), 3 * item * parents
+    parent += entry(table, level, PARENTS_START)
+    return images[0] + details, images[1] + details, images[2] + parent, images[3] + parent
 
 
 @triton.jit
@@ -240,28 +251,27 @@ def local_difference(
     parent,
     other,
     numbers,
+    table,
     local,
-    height,
-    width,
-    above,
-    across,
-    top,
-    left,
+    levels,
+    nodes,
+    parents,
     block: tl.constexpr,
 ):
-    """Write the local visual difference (B, 1, h, w)."""
-    numbers = _loaded(numbers)
-    node = tl.program_id(0) * block + tl.arange(0, block)
-    sizes = (height, width, above, across, top, left)
-    images, item, plane, parents = _of_item((details, others, parent, other), sizes)
-    sums = _pooled(images, numbers, node, plane, parents, sizes)
+    """Write the local visual difference (B, 1, ``nodes``)."""
+    level, node = level_of(table, levels, FIRST, block)
+    nodes, parents = nodes.to(tl.int64), parents.to(tl.int64)
+    numbers, sizes = _loaded(numbers, level), sizes_of(table, level)
+    images = _of_program((details, others, parent, other), table, level, nodes, parents)
+    sums = _pooled(images, numbers, node, nodes, parents, sizes)
     (total,) = _zeros(node, local, 1)
     for channel in tl.static_range(3):
         base, factor = _unmasked(sums, channel, numbers)
         for number in tl.static_range(3 * channel, 3 * channel + 3):
             energy = tl.minimum(sums[number] / base * factor, LARGEST_ENERGY)
             total += energy * energy * energy
-    tl.store(local + item * plane + node, total, node < plane)
+    local += tl.program_id(1).to(tl.int64) * nodes + entry(table, level, START)
+    tl.store(local + node, total, node < sizes[0] * sizes[1])
 
 
 # The gradient: first what is to be pooled again; then, parent by parent, the gradients themselves.
@@ -275,27 +285,26 @@ def slopes(
     parent,
     other,
     numbers,
+    table,
     found,
-    height,
-    width,
-    above,
-    across,
-    top,
-    left,
+    levels,
+    nodes,
+    parents,
     block: tl.constexpr,
 ):
-    """Write the gradients by pooled energies, (B, 12, h, w): nine of differences, three of masks.
+    """Write the gradients by pooled energies, (B, 12, ``nodes``): nine of differences, three masks.
 
-    ``gradient`` is that by the local visual difference, (B, 1, h, w).
+    ``gradient`` is that by the local visual difference, (B, 1, ``nodes``).
     """
-    numbers = _loaded(numbers)
-    node = tl.program_id(0) * block + tl.arange(0, block)
-    sizes = (height, width, above, across, top, left)
-    images, item, plane, parents = _of_item((details, others, parent, other), sizes)
-    sums = _pooled(images, numbers, node, plane, parents, sizes)
-    inside = node < plane
-    found += 12 * item * plane + node
-    by_local = tl.load(gradient + item * plane + node, inside, 0.0)
+    level, node = level_of(table, levels, FIRST, block)
+    nodes, parents = nodes.to(tl.int64), parents.to(tl.int64)
+    numbers, sizes = _loaded(numbers, level), sizes_of(table, level)
+    images = _of_program((details, others, parent, other), table, level, nodes, parents)
+    sums = _pooled(images, numbers, node, nodes, parents, sizes)
+    inside, item = node < sizes[0] * sizes[1], tl.program_id(1).to(tl.int64)
+    start = entry(table, level, START)
+    found += 12 * item * nodes + start + node
+    by_local = tl.load(gradient + item * nodes + start + node, inside, 0.0)
     double = 2.0 * numbers[TRANSDUCER_EXPONENT]
     for channel in tl.static_range(3):
         base, factor = _unmasked(sums, channel, numbers)
@@ -306,8 +315,8 @@ def slopes(
             # Where the energy is clamped there is no slope.
             slope = tl.where(energy <= LARGEST_ENERGY, 3.0 * energy * energy, 0.0) * by_local
             hidden += slope * tl.minimum(energy, LARGEST_ENERGY)
-            tl.store(found + number * plane, slope * gain, inside)
-        tl.store(found + (9 + channel) * plane, -double * hidden / base, inside)
+            tl.store(found + number * nodes, slope * gain, inside)
+        tl.store(found + (9 + channel) * nodes, -double * hidden / base, inside)
 
 
 @triton.jit
@@ -378,16 +387,14 @@ def gradients(
     parent,
     other,
     numbers,
+    table,
     by_details,
     by_others,
     by_parent,
     by_other,
-    height,
-    width,
-    above,
-    across,
-    top,
-    left,
+    levels,
+    nodes,
+    parents,
     first: tl.constexpr,
     second: tl.constexpr,
     block: tl.constexpr,
@@ -396,16 +403,17 @@ def gradients(
 
     ``first``, ``second``: whether those of the first and of the second image are wanted.
     """
-    numbers = _loaded(numbers)
-    node = tl.program_id(0) * block + tl.arange(0, block)
-    sizes = (height, width, above, across, top, left)
-    images, item, plane, parents = _of_item((details, others, parent, other), sizes)
-    found, _, _, _ = _of_item((by_details, by_others, by_parent, by_other), sizes)
+    level, node = level_of(table, levels, FIRST_OF_PARENTS, block)
+    nodes, parents = nodes.to(tl.int64), parents.to(tl.int64)
+    numbers, sizes = _loaded(numbers, level), sizes_of(table, level)
+    height, width, above, across, top, left = sizes
+    images = _of_program((details, others, parent, other), table, level, nodes, parents)
     details, others, parent, other = images
-    by_details, by_others, by_parent, by_other = found
-    slope += 12 * item * plane
-    known = node < parents
-    seen = tl.minimum(node, parents - 1)
+    found = (by_details, by_others, by_parent, by_other)
+    by_details, by_others, by_parent, by_other = _of_program(found, table, level, nodes, parents)
+    slope += 12 * tl.program_id(1).to(tl.int64) * nodes + entry(table, level, START)
+    known = node < above * across
+    seen = tl.minimum(node, above * across - 1)
     one, two = _sight(parent, parents, seen, numbers), _sight(other, parents, seen, numbers)
     by_one, by_two = _zeros(node, details, 6), _zeros(node, details, 6)
     for child in range(4):
@@ -417,13 +425,13 @@ def gradients(
             row, column = _neighbour(number, y, x, height, width)
             added = ()
             for each in tl.static_range(12):
-                value = tl.load(slope + each * plane + row * width + column)
+                value = tl.load(slope + each * nodes + row * width + column)
                 added = added + (pooled[each] + value,)
             pooled = added
         row, column = _neighbour(4, y, x, height, width)
         at = row * width + column
-        weighted = _weighted(details, plane, at, one, numbers)
-        others_weighted = _weighted(others, plane, at, two, numbers)
+        weighted = _weighted(details, nodes, at, one, numbers)
+        others_weighted = _weighted(others, nodes, at, two, numbers)
         by_weighted, by_others_weighted = (), ()
         for each in tl.static_range(9):
             by_difference = pooled[each] * (weighted[each] - others_weighted[each])
@@ -435,11 +443,11 @@ def gradients(
             by_others_weighted = by_others_weighted + (2.0 * slope_of_two / POOLED,)
         if first:
             by_one = _by_details(
-                details, plane, at, inside, one, numbers, by_weighted, by_details, by_one
+                details, nodes, at, inside, one, numbers, by_weighted, by_details, by_one
             )
         if second:
             by_two = _by_details(
-                others, plane, at, inside, two, numbers, by_others_weighted, by_others, by_two
+                others, nodes, at, inside, two, numbers, by_others_weighted, by_others, by_two
             )
     if first:
         _by_parent(parent, parents, seen, known, one, numbers, by_one, by_parent)
