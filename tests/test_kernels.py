@@ -244,7 +244,7 @@ def test_the_way_down_is_the_models(size: tuple[int, int], batch: int) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-@pytest.mark.parametrize("size", [(1, 1), (5, 7), (64, 64), (70, 130)], ids=str)
+@pytest.mark.parametrize("size", [(1, 1), (5, 7), (64, 64), (70, 66)], ids=str)
 def test_what_is_not_finite_is_replaced_as_ever(size: tuple[int, int], dtype: torch.dtype) -> None:
     generator = torch.Generator().manual_seed(sum(size))
     test, reference = torch.rand(2, 2, 3, *size, generator=generator, dtype=dtype)

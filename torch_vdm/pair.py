@@ -210,9 +210,9 @@ class PairMetric(operators.Enrolled):
         test, reference, seen = self._checked(test, reference)
         total = self._total(test, reference)
         constants = self._constants(total.dtype, "summation_exponent")
-        exponent = constants["summation_exponent"]
-        jnd = self.scheduled(test, reference).once(just_noticeable, total, exponent)
-        return self._at_pixels(jnd, test, reference, seen)
+        schedule = self.scheduled(test, reference)
+        jnd = schedule.once(just_noticeable, total, constants["summation_exponent"])
+        return self._at_pixels(jnd, schedule, (test.shape[-2], test.shape[-1]), seen)
 
     def power(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the accumulated differences before the root is taken: the map to a power.
@@ -228,15 +228,16 @@ class PairMetric(operators.Enrolled):
 
     def _power(self, test: Tensor, reference: Tensor, seen: Tensor | None) -> Tensor:
         """Return `power` of two checked batches."""
-        return self._at_pixels(self._total(test, reference), test, reference, seen)
+        schedule = self.scheduled(test, reference)
+        total, size = self._total(test, reference), (test.shape[-2], test.shape[-1])
+        return self._at_pixels(total, schedule, size, seen)
 
     def _at_pixels(
-        self, plane: Tensor, test: Tensor, reference: Tensor, seen: Tensor | None
+        self, plane: Tensor, schedule: Schedule, size: tuple[int, int], seen: Tensor | None
     ) -> Tensor:
-        """Return a plane of `_accumulated`, or of its root, as a map of two checked images."""
-        steps = self.scheduled(test, reference)
-        plane = self._to_pixels(plane, (test.shape[-2], test.shape[-1]))
-        return plane if seen is None else steps.once(masked, plane, seen)
+        """Return a plane of `_accumulated`, or of its root, as a map, 0 where a mask is not set."""
+        at_pixels = self._to_pixels(plane, size)
+        return at_pixels if seen is None else schedule.once(masked, at_pixels, seen)
 
     def _has_own_constants(self) -> bool:
         """Return whether no constant is replaced, and none requires a gradient."""

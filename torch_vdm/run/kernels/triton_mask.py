@@ -29,8 +29,10 @@ def _added(one, other):
 @triton.jit
 def _halved(plane, side: tl.constexpr):
     """Return the means of 2x2 of a square plane."""
-    squares = tl.reshape(plane, (side // 2, 2, side // 2, 2))
-    return 0.25 * tl.reduce(tl.reduce(squares, 3, _added), 1, _added)
+    left, right = tl.split(tl.reshape(plane, (side, side // 2, 2)))
+    rows = tl.reshape(left + right, (side // 2, 2, side // 2))
+    top, bottom = tl.split(tl.permute(rows, (0, 2, 1)))
+    return 0.25 * (top + bottom)
 
 
 @triton.jit
@@ -50,13 +52,13 @@ def _smaller(plane, block: tl.constexpr):
 
 
 @triton.jit
-def _around(total, shares, block: tl.constexpr):
+def _around(total, share, block: tl.constexpr):
     """Return at every pixel the mean of the smallest square with a finite pixel; 0 if none has one.
 
-    ``total``: the sum of both images where they are finite, half of it; ``shares``: how much of
-    them is, at every size.
+    ``total``: the sum of both images where they are finite, half of it; ``share``: how much of them
+    is.
     """
-    totals = _smaller(total, block)
+    totals, shares = _smaller(total, block), _smaller(share, block)
     found = totals[HALVINGS] / tl.maximum(shares[HALVINGS], TINY)
     for up in tl.static_range(1, HALVINGS + 1):
         mean = totals[HALVINGS - up] / tl.maximum(shares[HALVINGS - up], TINY)
@@ -92,14 +94,17 @@ def finite_in_both(
     both, either = in_test & in_reference, in_test | in_reference
     tl.store(seen + item * plane + at, both.to(tl.uint8), inside)
     share = 0.5 * (in_test.to(test.dtype.element_ty) + in_reference.to(test.dtype.element_ty))
-    shares = _smaller(share, block)
+    lost = _smaller((inside & ~either).to(test.dtype.element_ty), block)[HALVINGS]
+    lost = tl.reduce(tl.reduce(lost, 1, _added), 0, _added)
     finite_test += 3 * item * plane + at
     finite_reference += 3 * item * plane + at
     for channel in tl.static_range(3):
         one = tl.load(test + channel * plane + at, inside, 0.0)
         two = tl.load(reference + channel * plane + at, inside, 0.0)
-        total = 0.5 * (tl.where(in_test, one, 0.0) + tl.where(in_reference, two, 0.0))
-        filled = tl.where(either, tl.where(in_test, one, two), _around(total, shares, block))
+        filled = tl.where(in_test, one, two)
+        if lost > 0:
+            total = 0.5 * (tl.where(in_test, one, 0.0) + tl.where(in_reference, two, 0.0))
+            filled = tl.where(either, filled, _around(total, share, block))
         tl.store(finite_test + channel * plane, tl.where(both, one, filled), inside)
         tl.store(finite_reference + channel * plane, tl.where(both, two, filled), inside)
 
