@@ -1,10 +1,13 @@
 """What tensors without values tell: no read-back from a device, and no device left behind."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
 
-from torch_vdm import VDM, Haar, Observer, StationaryHaar, Steerable, VDMLoss
+from torch_vdm import VDM, Haar, Observer, StationaryHaar, Steerable, VDMLoss, pair, vdm
 from torch_vdm.model.cortex import Transform
 
 each_transform = pytest.mark.parametrize(
@@ -49,6 +52,45 @@ def test_nothing_comes_from_the_processor_after_the_first_call(
             for owner, name in ((torch, "tensor"), (torch, "as_tensor"), (torch, "from_numpy")):
                 monkeypatch.setattr(owner, name, refuse)
             monkeypatch.setattr(torch.Tensor, "new_tensor", refuse)
+
+
+class Order(TorchDispatchMode):
+    """Notes what is computed, and what is read back."""
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]  # torch's own
+        self.names: list[str] = []
+
+    def __torch_dispatch__(  # noqa: D105  # torch's own
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        del types
+        self.names.append(func.overloadpacket.__name__)
+        return func(*args, **(kwargs or {}))
+
+
+@each_transform
+def test_a_gpu_is_asked_last_whether_images_are_finite(
+    transform: Transform, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (pair, vdm):
+        monkeypatch.setattr(module, "is_queued", lambda _: True)
+    loss = VDMLoss(transform=transform)
+    test, reference = torch.rand(2, 2, 3, 21, 34)
+    for function in (loss.metric, loss.metric.power, loss.of_items):
+        function(test, reference)  # the first call looks at the range
+        with Order() as order:
+            function(test, reference)
+        assert order.names.count("_local_scalar_dense") == 1
+        # After the last pixel, sums alone.
+        after = order.names[order.names.index("_local_scalar_dense") :]
+        assert set(after) <= {"_local_scalar_dense", "detach"}
+    lost = test.clone()
+    lost[1, 2, 3, 4] = torch.nan
+    for images, name in (((lost, reference), "test"), ((test, lost), "reference")):
+        for function in (loss.metric, loss.metric.power, loss.of_items):
+            with pytest.raises(ValueError, match=rf"the {name}'s batch item 1, .* at x 4, y 3"):
+                function(*images)
 
 
 def test_nothing_is_read_back_by_sarnoffs_model() -> None:

@@ -63,12 +63,24 @@ def can_be_read(image: Tensor) -> bool:
     )
 
 
-def require_finite(name: str, image: Tensor, origin: tuple[int, int, int]) -> None:
-    """Raise if ``image`` has NaN or infinity, naming the first such item and pixel."""
-    # One cheap pass: the sum of an image that is not finite is not finite either.
-    if bool(torch.isfinite(image.detach().sum())):
+def is_queued(image: Tensor) -> bool:
+    """Return whether its device computes while Python goes on, so that reading a value waits."""
+    return image.device.type not in ("cpu", "meta")
+
+
+def require_finite(test: Tensor, reference: Tensor, origin: tuple[int, int, int]) -> None:
+    """Raise if an image has NaN or infinity, naming the first such item and pixel."""
+    images = {"test": test.detach(), "reference": reference.detach()}
+    # One cheap pass, and one number: the sum of an image that is not finite is not finite either.
+    first, second = (image.sum() for image in images.values())
+    if bool(torch.isfinite(first + second)):
         return
-    bad = ~torch.isfinite(image.detach())
+    for name, image in images.items():
+        _require_finite(name, image, origin)
+
+
+def _require_finite(name: str, image: Tensor, origin: tuple[int, int, int]) -> None:
+    bad = ~torch.isfinite(image)
     if not bool(bad.any()):
         return
     item = int(bad.flatten(1).any(1).nonzero()[0])

@@ -114,16 +114,19 @@ class VDMLoss(operators.Enrolled):
 
     def of_items(self, test: Tensor, reference: Tensor, mask: Tensor | None = None) -> Tensor:
         """Return the loss of every item, (B,); arguments as in `forward`."""
-        test, reference, seen = self.metric._checked(test, reference)
+        test, reference, seen = self.metric._checked(test, reference, later=True)
         # The L1 term first: its intermediate results are freed before the metric needs most memory.
         l1 = self._in_rows(test, reference) if self.l1 else 0.0
         power = self.metric._power(test, reference, seen)
         exponent = self.metric.observer.summation_exponent / EXPONENT
         once = self.metric.scheduled(test, reference).once
+        items: Tensor
         if mask is None:
-            items: Tensor = once(mean_of_items, power, exponent, l1, self.l1)
-            return items
-        return self._weighted(once(of_pixels, power, exponent, l1, self.l1), mask)
+            items = once(mean_of_items, power, exponent, l1, self.l1)
+        else:
+            items = self._weighted(once(of_pixels, power, exponent, l1, self.l1), mask)
+        self.metric._require_finite_later(test, reference)
+        return items
 
     def compile(self, *args: Any, **kwargs: Any) -> Self:  # type: ignore[override]
         """Switch the metric to its compiled route, `VDM.compile`."""

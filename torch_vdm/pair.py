@@ -16,6 +16,7 @@ from torch_vdm.images import (
     can_be_read,
     finite_in_both,
     has_values,
+    is_queued,
     masked,
     range_of,
     refuse_onnx,
@@ -110,7 +111,7 @@ class PairMetric(operators.Enrolled):
             gradients and test.requires_grad != reference.requires_grad,
             self._compiles,
             self._checkpointed,
-            test.device.type not in ("cpu", "meta"),
+            is_queued(test),
             torch.compiler.is_compiling(),
         )
 
@@ -207,12 +208,14 @@ class PairMetric(operators.Enrolled):
         """
         if operators.is_wanted() and self._has_own_constants():
             return operators.difference_map(test, reference, self._number, power=False)
-        test, reference, seen = self._checked(test, reference)
+        test, reference, seen = self._checked(test, reference, later=True)
         total = self._total(test, reference)
         constants = self._constants(total.dtype, "summation_exponent")
         schedule = self.scheduled(test, reference)
         jnd = schedule.once(just_noticeable, total, constants["summation_exponent"])
-        return self._at_pixels(jnd, schedule, (test.shape[-2], test.shape[-1]), seen)
+        jnd = self._at_pixels(jnd, schedule, (test.shape[-2], test.shape[-1]), seen)
+        self._require_finite_later(test, reference)
+        return jnd
 
     def power(self, test: Tensor, reference: Tensor) -> Tensor:
         """Return the accumulated differences before the root is taken: the map to a power.
@@ -224,7 +227,10 @@ class PairMetric(operators.Enrolled):
         """
         if operators.is_wanted() and self._has_own_constants():
             return operators.difference_map(test, reference, self._number, power=True)
-        return self._power(*self._checked(test, reference))
+        test, reference, seen = self._checked(test, reference, later=True)
+        power = self._power(test, reference, seen)
+        self._require_finite_later(test, reference)
+        return power
 
     def _power(self, test: Tensor, reference: Tensor, seen: Tensor | None) -> Tensor:
         """Return `power` of two checked batches."""
@@ -302,11 +308,16 @@ class PairMetric(operators.Enrolled):
             )
 
     def _checked(
-        self, test: Tensor, reference: Tensor, origin: tuple[int, int, int] = (0, 0, 0)
+        self,
+        test: Tensor,
+        reference: Tensor,
+        origin: tuple[int, int, int] = (0, 0, 0),
+        later: bool = False,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return both images in the computing precision, and where they are finite (masked).
 
-        ``origin`` is where a part lies in a larger batch, for messages: item, y, x.
+        ``origin`` is where a part lies in a larger batch, for messages: item, y, x. ``later``:
+        `_require_finite_later` follows, when the device has been given all else to do.
         """
         refuse_onnx()
         for name, image in (("a test", test), ("a reference", reference)):
@@ -323,11 +334,22 @@ class PairMetric(operators.Enrolled):
         seen: Tensor | None = None
         if self.nonfinite == "mask":
             test, reference, seen = self._finite_in_both(test, reference)
-        elif self._reads(test):
-            require_finite("test", test, origin)
-            require_finite("reference", reference, origin)
+        elif not (later and is_queued(test)):
+            self._require_finite(test, reference, origin)
         self._look_at_range(test, reference)
         return test, reference, seen
+
+    def _require_finite(
+        self, test: Tensor, reference: Tensor, origin: tuple[int, int, int] = (0, 0, 0)
+    ) -> None:
+        """Raise if an image is not finite, where values are to be read back."""
+        if self._reads(test):
+            require_finite(test, reference, origin)
+
+    def _require_finite_later(self, test: Tensor, reference: Tensor) -> None:
+        """Do so of images that were `_checked` except for this."""
+        if is_queued(test):
+            self._require_finite(test, reference)
 
     def _finite_in_both(self, test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return `finite_in_both` of two images in the computing precision."""

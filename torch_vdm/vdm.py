@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_vdm.effects import Effects
 from torch_vdm.images import SQUARE as WHOLE_SQUARE
-from torch_vdm.images import can_be_read, masked
+from torch_vdm.images import can_be_read, is_queued, masked
 from torch_vdm.model.cones import XYZ_TO_SML
 from torch_vdm.model.contrast import SML_TO_OPPONENTS
 from torch_vdm.model.cortex import DEEPEST, Cortex, Haar, Transform, bands
@@ -67,11 +67,12 @@ class VDM(PairMetric):
         is then a ValueError, where values may be read.
     nonfinite
         "raise": NaN or infinity in an image is a ValueError that names the batch item (a graph
-        of torch.export cannot raise: there it gives NaN). For this, one number per image is read
-        back from the device, and one for a mask of `VDMLoss`. "mask": such pixels are taken as
-        equal in both images, with the value that one of them has, or otherwise that of their
-        surroundings, and the map is 0 there; nothing is read back. In both cases the first call
-        reads once more, to warn of values that are not sRGB codes where the display expects these.
+        of torch.export cannot raise: there it gives NaN). For this, one number is read back from
+        the device, on a GPU when all else has been launched there, and one for a mask of
+        `VDMLoss`. "mask": such pixels are taken as equal in both images, with the value that one of
+        them has, or otherwise that of their surroundings, and the map is 0 there; nothing is read
+        back. In both cases the first call reads once more, to warn of values that are not sRGB
+        codes where the display expects these.
     schedule
         How it is computed, which changes only the last bits of results; by default chosen for each
         pair, see `scheduled`.
@@ -212,7 +213,7 @@ class VDM(PairMetric):
                 )
             return replace(everything(names, len(test)), grey=True)
         job = self._job(test, reference)
-        reads = self.nonfinite == "raise" and test.device.type == "cpu" and can_be_read(test)
+        reads = self.nonfinite == "raise" and not is_queued(test) and can_be_read(test)
         by_kernel = self.schedule is not None and self.schedule.kernel  # of all there is
         if (
             not self._planned
