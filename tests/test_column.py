@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from torch_vdm import Haar
+from torch_vdm.model.cortex.border import weights
+from torch_vdm.model.grid import Side
 from torch_vdm.model.quadtree import push, surround
 from torch_vdm.run.column import cells_of, column_of, joined
 
@@ -26,6 +28,23 @@ def test_a_node_gets_what_is_pushed_to_it(size: tuple[int, int], true_means: boo
         assert torch.equal(plane, push(parents, sizes[number], before))
     levels = column.planes(column.level[:, None])
     assert [set(level.flatten().tolist()) for level in levels] == [{n} for n in range(len(sizes))]
+
+
+def test_what_is_kept_is_not_transformed() -> None:
+    # Otherwise a later call would get what belongs to a transformation that has ended.
+    sizes = ((1, 1), (1, 2), (2, 3))
+    found: list[torch.Tensor] = []
+
+    def total(plane: torch.Tensor) -> torch.Tensor:
+        column = column_of(sizes, [(0, 0)] * 3, torch.zeros(1))
+        found.extend((column.level, column.parent, *cells_of(sizes, (1, 1), torch.zeros(1))))
+        down, across = weights((Side(1, 0.5, 1.0),) * 2, (11, 13), torch.zeros(1))
+        found.extend((*down, *across))
+        return plane.sum()
+
+    torch.func.grad(total)(torch.ones(2, 3))
+    assert len(found) == 8
+    assert not any(map(torch._C._functorch.is_functorch_wrapped_tensor, found))
 
 
 @pytest.mark.parametrize("ring", [(0, 0), (1, 1), (3, 2)], ids=str)

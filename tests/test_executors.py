@@ -6,6 +6,8 @@ from collections.abc import Callable
 import pytest
 import torch
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.autograd import forward_ad
 
 from torch_vdm import VDM, Effects, Haar, Observer, StationaryHaar, Steerable, VDMLoss
 from torch_vdm.model.cortex import Transform
@@ -126,6 +128,34 @@ def test_with_every_effect(effects: Effects, transform: Transform) -> None:
         torch.testing.assert_close(
             actual, model.to_pixels(expected, (70, 41)), rtol=1e-9, atol=1e-20, msg=name
         )
+
+
+# torch's own, of what forward-mode gradients need.
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:FutureWarning")
+def test_nothing_is_compiled_of_what_is_transformed_or_has_no_values(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(function: object) -> None:
+        raise AssertionError(f"{function} is compiled")
+
+    monkeypatch.setattr(limits, "compiled", refuse)
+    fast = VDM(schedule=SCHEDULES["a GPU's, compiled"], nonfinite="mask")
+    metric, (test, reference) = VDM(nonfinite="mask"), pair((40, 33))
+    with pytest.raises(AssertionError, match="is compiled"):
+        fast(test, reference)
+    slopes, tangents = [], []
+    for one in (fast, metric):
+        slopes.append(torch.func.grad(lambda a: one.power(a, reference).sum())(test))  # noqa: B023
+        with forward_ad.dual_level():
+            dual = forward_ad.make_dual(test, torch.ones_like(test))
+            tangents.append(forward_ad.unpack_dual(one.power(dual, reference)).tangent)
+    assert tangents[0] is not None
+    torch.testing.assert_close(slopes[0], slopes[1], rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(tangents[0], tangents[1], rtol=1e-9, atol=1e-12)
+    with FakeTensorMode():
+        fake = torch.rand(2, 3, 40, 33)
+        metric = VDM(schedule=SCHEDULES["a GPU's, compiled"])
+        assert metric(fake, fake).shape == (2, 1, 40, 33)
 
 
 @pytest.mark.parametrize("transform", TRANSFORMS, ids=repr)

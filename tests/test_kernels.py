@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from benchmarks.places import ROOT
 from torch_vdm import VDM, Effects, Haar, Observer, Steerable, VDMLoss
@@ -313,6 +314,29 @@ def test_grey_images_too() -> None:
     image, other = (plane[:, :1].expand(-1, 3, -1, -1) for plane in pair(4, 3))
     assert not VDM(schedule=KERNEL).plan(image, other).grey
     torch.testing.assert_close(VDM(schedule=KERNEL)(image, other), VDM()(image, other))
+
+
+@pytest.mark.parametrize("batches", [(1, 2), (2, 1)], ids=str)
+def test_one_image_is_compared_with_many(batches: tuple[int, int]) -> None:
+    generator = torch.Generator().manual_seed(3)
+    images = [
+        torch.rand(batch, 3, 3, 4, dtype=torch.float64, generator=generator) for batch in batches
+    ]
+    found = []
+    for schedule in (KERNEL, PLAIN):
+        metric = VDM(30.0, schedule=schedule)
+        leaves = [image.clone().requires_grad_() for image in images]
+        power = metric.compare(*map(metric.represent, leaves))
+        assert len(power) == 2
+        found.append([power.detach(), *torch.autograd.grad(power.sum(), leaves)])
+    assert_close(*found)
+
+
+def test_images_without_values_are_refused() -> None:
+    with FakeTensorMode():
+        image = torch.rand(1, 3, 4, 4)
+        with pytest.raises(ValueError, match=r"expected images on a GPU .* without values"):
+            VDM(schedule=KERNEL)(image, image)
 
 
 def test_strips_too(monkeypatch: pytest.MonkeyPatch) -> None:

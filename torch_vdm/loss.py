@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_vdm.model.cortex import Haar
-from torch_vdm.model.display import Display
+from torch_vdm.model.display import Display, codes
 from torch_vdm.model.distance import just_noticeable
 from torch_vdm.observer import Observer
 from torch_vdm.options import choice, number, switch
@@ -138,9 +138,9 @@ class VDMLoss(operators.Enrolled):
         schedule = self.metric.scheduled(test, reference)
         if schedule.cached:
             schedule = replace(schedule, compiled=False)
-        display = self.metric.display
+        scale = self.metric.display.white_scale(test)
         return schedule.pixels(
-            lambda *part: schedule.once(absolute_difference, *part, display), test, reference
+            lambda *part: schedule.once(absolute_difference, *part, scale), test, reference
         )
 
     def _weighted(self, plane: Tensor, mask: Tensor) -> Tensor:
@@ -158,10 +158,12 @@ class VDMLoss(operators.Enrolled):
         )
 
 
-def absolute_difference(test: Tensor, reference: Tensor, display: Display) -> Tensor:
-    """Return the mean absolute difference of sRGB-coded values, (B, 1, H, W)."""
-    difference = display.to_code(test) - display.to_code(reference)
-    return difference.abs().mean(1, keepdim=True)
+def absolute_difference(test: Tensor, reference: Tensor, scale: Tensor | None) -> Tensor:
+    """Return the mean absolute difference of sRGB-coded values, (B, 1, H, W).
+
+    ``scale`` is the display's `Display.white_scale`.
+    """
+    return (codes(test, scale) - codes(reference, scale)).abs().mean(1, keepdim=True)
 
 
 def of_pixels(power: Tensor, exponent: float, absolute: Tensor | float, l1: float) -> Tensor:

@@ -116,7 +116,7 @@ class PairMetric(operators.Enrolled):
         )
 
     def scheduled(self, test: Tensor, reference: Tensor) -> Schedule:
-        """Return how a pair, (B, 3, H, W) twice, is computed; `repr` shows it."""
+        """Return how a pair, (B, 3, H, W) twice, is computed."""
         return chosen(self._job(test, reference))
 
     def _to_pixels(self, plane: Tensor, size: tuple[int, int], grid: Grid | None = None) -> Tensor:
@@ -186,7 +186,9 @@ class PairMetric(operators.Enrolled):
 
         ``torch.compile`` of the metric, or of a step that calls it, does not do this: there the
         metric is one operator, which takes the same route as elsewhere. This takes no arguments,
-        needs a C++ compiler, and returns the module itself, unlike `nn.Module.compile`.
+        needs a C++ compiler, and returns the module itself, unlike `nn.Module.compile`. A graph
+        then serves one backward pass: torch's compiled code retains none, and has no second
+        derivatives. Under `torch.func` nothing is compiled.
         """
         if args or kwargs:
             raise ValueError("expected no arguments: the fast route has no options")

@@ -128,11 +128,14 @@ class Display:
         above 1, its linear part below 0. The shape is (B, 3, H, W), as before. This serves a loss:
         0.01 is about as visible on black as on white.
         """
+        return codes(image, self.white_scale(image))
+
+    def white_scale(self, image: Tensor) -> Tensor | None:
+        """Return what makes values relative to white, like ``image``; None if they are codes."""
         if self.encoding == "srgb":
-            return within(image, LARGEST_CODE)
+            return None
         white = XYZ_WHITE if self.encoding == "xyz" else self.white
-        light = image * (self.gain / white)
-        return encode_srgb(within(light, BRIGHTEST))
+        return image.new_full((), self.gain / white)
 
 
 def linear_values(image: Tensor, encoding: str, limit: Tensor | None) -> Tensor:
@@ -140,6 +143,13 @@ def linear_values(image: Tensor, encoding: str, limit: Tensor | None) -> Tensor:
     if encoding == "srgb":
         image = decode_srgb(image)
     return image if limit is None else image.clamp(-limit, limit)
+
+
+def codes(image: Tensor, scale: Tensor | None) -> Tensor:
+    """Return `Display.to_code`; ``scale`` is its `white_scale`."""
+    if scale is None:
+        return within(image, LARGEST_CODE)
+    return encode_srgb(within(image * scale, BRIGHTEST))
 
 
 def encode_srgb(light: Tensor) -> Tensor:

@@ -54,7 +54,7 @@ class Derived(NamedTuple):
     """What all levels respond to, the coarsest first."""
     to_cones: Tensor
     """(3, 3), from linear values to cones."""
-    bands: filtering.Weights | None
+    bands: filtering.Weights | None = None
     """What filters the images, where they are filtered."""
 
 

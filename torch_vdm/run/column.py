@@ -104,7 +104,8 @@ def kept_for(like: Tensor) -> Callable[..., Any]:
 # Those of a 4K image take 100 MB together. Status: choice.
 @lru_cache(maxsize=32)
 def _kept(function: Callable[..., Any], *arguments: Any) -> Any:
-    with torch.inference_mode(False):
+    # Nothing of the call in which it is made, which may be transformed, is kept.
+    with torch.inference_mode(False), torch._C._DisableFuncTorch():
         return function(*arguments)
 
 

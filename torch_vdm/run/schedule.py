@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from torch._subclasses.fake_tensor import is_fake
 from torch.utils.checkpoint import checkpoint
 
 from torch_vdm.model.cortex import bands
@@ -98,7 +99,7 @@ class Schedule(Steps):
 
     def once(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return what a pure function returns, on a GPU by as few operations as possible."""
-        if not self.compiled or self.cached:
+        if self.cached or not self._may_compile(_first(arguments)):
             return function(*arguments)
         # A user's image, or half of a batch, may be a part of another.
         whole = (_unviewed(each) if isinstance(each, Tensor) else each for each in arguments)
@@ -136,7 +137,12 @@ class Schedule(Steps):
     def _compiles(self, first: Tensor) -> bool:
         """Return whether a step with this first plane is compiled."""
         # A side that becomes 1 would need another form.
-        return self.compiled and first.numel() >= SMALLEST and first.shape[-2] > 2
+        large = first.numel() >= SMALLEST and first.shape[-2] > 2
+        return large and self._may_compile(first)
+
+    def _may_compile(self, first: Tensor) -> bool:
+        """Return whether steps are compiled: not under `torch.func`, nor without values."""
+        return self.compiled and is_plain() and not is_fake(first)
 
     def part(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return what several steps return; compiled graphs choose by themselves what they keep."""

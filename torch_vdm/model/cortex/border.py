@@ -99,7 +99,8 @@ def weights(sides: tuple[Side, Side], nodes: tuple[int, int], like: Tensor) -> t
 
 @lru_cache(maxsize=512)
 def _kept(*of: Any) -> tuple[Down, Across]:
-    with torch.inference_mode(False):
+    # Nothing of the call in which they are made, which may be transformed, is kept.
+    with torch.inference_mode(False), torch._C._DisableFuncTorch():
         return _made(*of)
 
 

@@ -6,7 +6,7 @@ each of which a GPU waits for. On a processor only Triton's interpreter runs ker
 does so where TRITON_INTERPRET=1 was set before they are first used.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_vdm.effects import Effects
+from torch_vdm.images import has_values
 from torch_vdm.model.cortex import Haar, Transform
 from torch_vdm.observer import Observer
 
@@ -45,15 +46,33 @@ def require(observer: Observer, transform: Transform, effects: Effects) -> None:
         )
 
 
-def of(module: str, device: torch.device) -> Any:
-    """Return a module of kernels; raise ValueError if they cannot run on a device."""
+def of(module: str, plane: Tensor) -> Any:
+    """Return a module of kernels; raise ValueError if they cannot run where a plane is."""
     kernels = import_module(f"torch_vdm.run.kernels.{module}")
-    if device.type == "meta" or (device.type == "cpu" and not kernels.INTERPRETED):
+    there = has_values(plane)
+    if not there or (plane.device.type == "cpu" and not kernels.INTERPRETED):
+        got = f"on {plane.device}" if there else "without values"
         raise ValueError(
-            f"expected images on a GPU for a schedule with the kernel, got them on {device}; leave "
-            "the kernel out, or set TRITON_INTERPRET=1 to try it slowly"
+            f"expected images on a GPU for a schedule with the kernel, got them {got}; leave the "
+            "kernel out, or set TRITON_INTERPRET=1 to try it slowly"
         )
     return kernels
+
+
+def differentiated(
+    function: Callable[..., Tensor],
+    planes: Sequence[Tensor],
+    wanted: Sequence[bool],
+    gradient: Tensor,
+) -> list[Tensor | None]:
+    """Return the gradients by those planes that are ``wanted``, as autograd does, for another one.
+
+    ``function`` returns what the kernel does, by steps of the model.
+    """
+    views = [plane.view_as(plane) for plane in planes]
+    inputs = [view for view, want in zip(views, wanted, strict=True) if want]
+    found = iter(torch.autograd.grad(function(*views), inputs, gradient, create_graph=True))
+    return [next(found) if want else None for want in wanted]
 
 
 def programs(nodes: int, block: int) -> int:

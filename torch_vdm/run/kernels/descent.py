@@ -43,7 +43,7 @@ class _Accumulated(torch.autograd.Function):
         leaves = local.new_empty(*local.shape[:2], *table.sizes[-1])
         planes = local, inherited, root.contiguous(), table.rows, total, leaves
         sizes = len(table.sizes), table.nodes
-        kernel = kernels.of("triton_descent", local.device).descent
+        kernel = kernels.of("triton_descent", local).descent
         kernels.launch(kernel, table.programs, len(local), planes, sizes)
         ctx.plain, ctx.table = plain, table
         ctx.save_for_backward(local, inherited, root, total)
@@ -54,13 +54,8 @@ class _Accumulated(torch.autograd.Function):
         local, inherited, root, total = ctx.saved_tensors
         wanted: tuple[bool, ...] = ctx.needs_input_grad[2:]
         if torch.is_grad_enabled():
-            # It will be differentiated again, so this is left to autograd.
-            planes = [plane.view_as(plane) for plane in (local, inherited, root)]
-            inputs = [plane for plane, want in zip(planes, wanted, strict=True) if want]
-            each = iter(
-                torch.autograd.grad(ctx.plain(*planes), inputs, gradient, create_graph=True)
-            )
-            return None, None, *(next(each) if want else None for want in wanted)
+            planes = local, inherited, root
+            return None, None, *kernels.differentiated(ctx.plain, planes, wanted, gradient)
         return None, None, *_gradients(gradient, local, inherited, root, total, ctx.table)
 
 
@@ -71,7 +66,7 @@ def _gradients(
     by_local, by_inherited = torch.empty_like(local), torch.empty_like(inherited)
     by_root = torch.empty_like(root, memory_format=torch.contiguous_format)
     apart(by_local, table.sizes)[-1].copy_(gradient)
-    kernel = kernels.of("triton_descent", local.device).ascent
+    kernel = kernels.of("triton_descent", local).ascent
     planes = by_local, total, inherited, root.contiguous(), table.rows, by_inherited, by_root
     for number in reversed(range(len(table.sizes))):
         parents = math.prod(table.sizes[max(number - 1, 0)])

@@ -94,7 +94,7 @@ def _launch(
     name: str, children: Tensor, before: Before, lowpass: Tensor, details: Tensor, *others: Tensor
 ) -> None:
     """Launch a kernel, of which a program writes a block of nodes or of children of a plane."""
-    kernel = getattr(kernels.of("triton_haar", children.device), name)
+    kernel = getattr(kernels.of("triton_haar", children), name)
     planes = [lowpass, details, *others]
     border = bool(others)
     sizes = [*children.shape[-2:], *before, *lowpass.shape[-2:]]

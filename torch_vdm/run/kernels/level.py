@@ -62,7 +62,7 @@ def _of_levels(
     """
     if not numbers:
         return ()
-    module = kernels.of("triton_level", first.mean.device)
+    module = kernels.of("triton_level", first.mean)
     before = [first.before[number] for number in numbers]
     details = [[cortex.details[number] for number in numbers] for cortex in (first, second)]
     parents = [[cortex.parent_lowpass(number) for number in numbers] for cortex in (first, second)]
@@ -80,7 +80,10 @@ def _of_levels(
         return joined(local)
 
     of_levels = module.numbers_of(parts, model.constants)
-    images = map(joined, (*details, *parents))
+    # One image may be compared with many.
+    items = max(len(first.mean), len(second.mean))
+    columns = map(joined, (*details, *parents))
+    images = (each.expand(items, *each.shape[1:]).contiguous() for each in columns)
     local: Tensor = _LocalDifference.apply(plain, module, of_levels, table, *images)
     return tuple(apart(local, sizes))
 
@@ -107,12 +110,7 @@ class _LocalDifference(torch.autograd.Function):
         numbers, *images = ctx.saved_tensors
         wanted: tuple[bool, ...] = ctx.needs_input_grad[4:]
         if torch.is_grad_enabled():
-            # It will be differentiated again, so this is left to autograd.
-            images = [image.view_as(image) for image in images]
-            inputs = [image for image, want in zip(images, wanted, strict=True) if want]
-            found = torch.autograd.grad(ctx.plain(*images), inputs, gradient, create_graph=True)
-            each = iter(found)
-            slopes = [next(each) if want else None for want in wanted]
+            slopes = kernels.differentiated(ctx.plain, images, wanted, gradient)
         else:
             slopes = _gradients(ctx.module, gradient, numbers, images, ctx.table, wanted)
         return None, None, None, None, *slopes

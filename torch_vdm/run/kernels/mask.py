@@ -19,7 +19,7 @@ class _FiniteInBoth(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         items, _, height, width = test.shape
-        kernel = kernels.of("triton_mask", test.device).finite_in_both
+        kernel = kernels.of("triton_mask", test).finite_in_both
         seen = torch.empty(items, 1, height, width, dtype=torch.uint8, device=test.device)
         found = torch.empty_like(test), torch.empty_like(reference)
         squares = kernels.programs(height, SQUARE) * kernels.programs(width, SQUARE)
