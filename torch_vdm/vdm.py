@@ -26,7 +26,6 @@ from torch_vdm.pair import Nonfinite, Numbers, PairMetric
 from torch_vdm.plan import Plan, everything, is_grey, plan_of
 from torch_vdm.precision import computed_in
 from torch_vdm.run import kernels, regions, strips, whole
-from torch_vdm.run.gradients import is_plain
 from torch_vdm.run.kernels import mask as kernel_of_mask
 from torch_vdm.run.schedule import Schedule
 from torch_vdm.run.tiles import Done, Progress, in_tiles
@@ -270,7 +269,7 @@ class VDM(PairMetric):
         return whole.accumulated(model, schedule, test, reference)
 
     def _finite_in_both(self, test: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        by_kernel = self.schedule is not None and self.schedule.kernel and is_plain()
+        by_kernel = self.schedule is not None and self.schedule.by_kernel
         found = kernel_of_mask.finite_in_both if by_kernel else super()._finite_in_both
         return found(test, reference)
 

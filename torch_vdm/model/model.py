@@ -8,7 +8,7 @@ border nodes count for the pixels that they have (``true_means``), and coarse di
 charged to the pixels that caused them (`Model.charges`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -239,20 +239,26 @@ class Model:
         It is (B, channels, 1, 1), not negative, 1 at threshold; and 0 for an observer that never
         compares them. A uniform change is seen here and nowhere else.
         """
-        means = self.cones(first.mean), self.cones(second.mean)
-        if self.observer.lowpass_gains is None:
-            return _nothing(*means)
-        constants = (self.constants[name] for name in ("dark_cones", "opponents", "lowpass_gains"))
-        return lowpass.lowpass_difference(*means, *constants)
+        return self._of_means(lowpass.lowpass_difference, first, second)
 
     def root(self, first: Cortex, second: Cortex) -> Tensor:
         """Return the value that every path starts from, (B, 1, 1, 1)."""
-        means = self.cones(first.mean), self.cones(second.mean)
+        return self._of_means(lowpass.root, first, second, "summation_exponent")
+
+    def _of_means(
+        self, function: Callable[..., Tensor], first: Cortex, second: Cortex, *others: str
+    ) -> Tensor:
+        """Return a function of `torch_vdm.model.lowpass`; 0 if the means are never compared.
+
+        ``others``: which constants it takes besides those of `lowpass.lowpass_difference`.
+        """
+        one, other = self.cones(first.mean), self.cones(second.mean)
         if self.observer.lowpass_gains is None:
-            return _nothing(*means)
-        names = "dark_cones", "opponents", "lowpass_gains", "summation_exponent"
+            # Part of the autograd graph, so that an image of one pixel has a gradient.
+            return 0.0 * one[:, :1] + 0.0 * other[:, :1]
+        names = "dark_cones", "opponents", "lowpass_gains", *others
         constants = (self.constants[name] for name in names)
-        found: Tensor = self.steps.once(lowpass.root, *means, *constants)
+        found: Tensor = self.steps.once(function, one, other, *constants)
         return found
 
     def changes(self, first: Cortex, second: Cortex) -> tuple[Tensor, ...]:
@@ -382,12 +388,6 @@ class Model:
                 for name in ("red_green", "yellow_violet")
             ]
         return torch.stack(channels, 1) / gain.unsqueeze(1) if channels else gain.unsqueeze(1)
-
-
-def _nothing(first: Tensor, second: Tensor) -> Tensor:
-    """Return 0 for every item: no difference between two means (B, C, 1, 1)."""
-    # Part of the autograd graph, so that an image of one pixel has a gradient.
-    return 0.0 * first[:, :1] + 0.0 * second[:, :1]
 
 
 def weights_alone(level: Level) -> Sight:

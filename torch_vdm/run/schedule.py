@@ -81,6 +81,11 @@ class Schedule(Steps):
     """Whether what has kernels of Triton is computed by them; see `torch_vdm.run.kernels`."""
 
     @property
+    def by_kernel(self) -> bool:
+        """Whether kernels are used here: not for what is traced or transformed."""
+        return self.kernel and is_plain()
+
+    @property
     def fused(self) -> bool:
         """As `Steps.fused`."""
         return self.compiled
@@ -132,7 +137,7 @@ class Schedule(Steps):
 
     def _has_kernel(self, function: Callable[..., Any]) -> bool:
         """Return whether a step is computed by a kernel."""
-        return self.kernel and function in BY_KERNEL and is_plain()
+        return self.by_kernel and function in BY_KERNEL
 
     def _compiles(self, first: Tensor) -> bool:
         """Return whether a step with this first plane is compiled."""

@@ -23,7 +23,7 @@ from torch_vdm.model.level import (
 from torch_vdm.model.model import Model, weights_alone
 from torch_vdm.run import schedule as limits
 from torch_vdm.run.column import Cells, Column, cells_of, column_of, joined
-from torch_vdm.run.gradients import by_hand, is_plain
+from torch_vdm.run.gradients import by_hand
 from torch_vdm.run.gradients.level import local_difference_by_hand
 from torch_vdm.run.kernels import descent as kernel_of_descent
 from torch_vdm.run.kernels import level as kernel_of_levels
@@ -46,8 +46,8 @@ def compared(model: Model, schedule: Schedule, first: Cortex, second: Cortex) ->
 
 def descended(model: Model, schedule: Schedule, paths: Paths, before: Sequence[Before]) -> Tensor:
     """Return `Model.descended`, computing what the coarsest levels are charged at once."""
-    if schedule.kernel and model.observer.charging and paths.local and is_plain():
-        _, charge = _charged(model, schedule, paths.changes, before)
+    if schedule.by_kernel and model.observer.charging and paths.local:
+        _, charge = _column_charge(model, schedule, paths.changes, before)
         return kernel_of_descent.accumulated(paths, charge, before)
     charges = _charges(model, schedule, paths.changes, before) if model.observer.charging else None
     down = schedule.form(passed_down, paths.root)
@@ -65,7 +65,7 @@ def local_differences(
 ) -> tuple[Tensor, ...]:
     """Return `Model.local_differences`, dropping the responses of a level once they are used."""
     levels = model.levels(first.finest, len(first.details))
-    if schedule.kernel and kernel_of_levels.is_usable(model):
+    if schedule.by_kernel and kernel_of_levels.is_usable(model):
         return kernel_of_levels.local_differences(model, first, second, levels)
     few = _few(schedule, first.details)
     return (
@@ -81,7 +81,7 @@ def level_difference(
     model: Model, schedule: Schedule, first: Cortex, second: Cortex, number: int, level: Level
 ) -> Tensor:
     """Return `Model.local_difference` of a level."""
-    if schedule.kernel and kernel_of_levels.is_usable(model):
+    if schedule.by_kernel and kernel_of_levels.is_usable(model):
         return kernel_of_levels.local_difference(model, first, second, number, level)
     details, others = first.details[number], second.details[number]
     options = model.options()
@@ -182,13 +182,13 @@ def _charges(
     few = _few(schedule, changes)
     coarse: list[Charge] = []
     if few:
-        column, (inherited, own) = _charged(model, schedule, changes[:few], before)
+        column, (inherited, own) = _column_charge(model, schedule, changes[:few], before)
         owns = [None] * few if own is None else column.planes(own)
         coarse = list(map(Charge, column.planes(inherited), owns))
     return coarse + (model.charges(changes[few:]) or [])
 
 
-def _charged(
+def _column_charge(
     model: Model, schedule: Schedule, changes: Sequence[Tensor], before: Sequence[Before]
 ) -> tuple[Column, Charge]:
     """Return `Model.charges` of levels, the coarsest first, in columns."""
@@ -196,11 +196,13 @@ def _charged(
     shifts, filtered = model.transform.shifts, model.transform.csf == "filter"
     cells = cells_of(column.sizes, (AROUND * shifts, AROUND * shifts), changes[0])
     options = shifts, filtered, schedule.cached
-    charge: Charge = schedule.once(_charge, joined(changes), cells, *options)
+    charge: Charge = schedule.once(_charge_within, joined(changes), cells, *options)
     return column, charge
 
 
-def _charge(column: Tensor, cells: Cells, shifts: int, filtered: bool, cached: bool) -> Charge:
+def _charge_within(
+    column: Tensor, cells: Cells, shifts: int, filtered: bool, cached: bool
+) -> Charge:
     """Return `charge_within` of levels in a column, in columns."""
     inherited, own = charge_within(cells.of(column), shifts, filtered, cached)
     return Charge(cells.column(inherited), None if own is None else cells.column(own))

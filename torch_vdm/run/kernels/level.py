@@ -12,17 +12,16 @@ from torch_vdm.model.level import local_difference as level_difference
 from torch_vdm.model.model import Model
 from torch_vdm.run import kernels
 from torch_vdm.run.column import apart, joined
-from torch_vdm.run.gradients import is_plain
 from torch_vdm.run.kernels.table import Table, table_of
 
 
 def is_usable(model: Model) -> bool:
     """Return whether the kernel computes a level; the model's steps do what it does not.
 
-    That is what is traced or transformed, and constants that need a gradient or are replaced.
+    That is constants that need a gradient or are replaced, and grey images as one plane.
     """
     fixed = not any(constant.requires_grad for constant in model.constants.values())
-    return fixed and model.cubes and model.grey is None and is_plain()
+    return fixed and model.cubes and model.grey is None
 
 
 def local_differences(

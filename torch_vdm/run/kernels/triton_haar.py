@@ -83,22 +83,14 @@ def analysis(
 
 
 @triton.jit
-def _gradient(
-    y,
-    x,
-    inside,
-    lowpass,
-    details,
-    window,
-    down,
-    half,
-    across,
-    height,
-    width,
-    of_details,
-    border: tl.constexpr,
-):
-    """Return the gradient by the child at a place that may lie beyond the border; 0 if outside."""
+def _gradient(y, x, inside, gradients, weights, height, width, of_details, border: tl.constexpr):
+    """Return the gradient by the child at a place that may lie beyond the border; 0 if outside.
+
+    ``gradients`` are those by what `analysis` writes, ``weights`` are ``down``, ``half``,
+    ``across``.
+    """
+    lowpass, details, window = gradients
+    down, half, across = weights
     node, on_bottom, on_right = (y // 2) * width + x // 2, y % 2 == 1, x % 2 == 1
     mean = tl.load(lowpass + node, inside, 0.0)
     horizontal = tl.load(details + node, inside, 0.0)
@@ -174,28 +166,17 @@ def synthesis(
     child = tl.program_id(0) * block + tl.arange(0, block)
     y, x, item = child // columns, child % columns, tl.program_id(1).to(tl.int64)
     inside = child < rows * columns
-    lowpass += item * of_lowpass
     details += 3 * item * of_details
-    window += item * of_window
+    gradients = (lowpass + item * of_lowpass, details, window + item * of_window)
+    weights = (down, half, across)
     total = tl.full(child.shape, 0.0, children.dtype.element_ty)
     for vertical in tl.static_range(3):
         row, of_row = _places(y, rows, top, vertical)
         for horizontal in tl.static_range(3):
             column, of_column = _places(x, columns, left, horizontal)
+            there = inside & of_row & of_column
             total += _gradient(
-                row,
-                column,
-                inside & of_row & of_column,
-                lowpass,
-                details,
-                window,
-                down,
-                half,
-                across,
-                height,
-                width,
-                of_details,
-                border,
+                row, column, there, gradients, weights, height, width, of_details, border
             )
     tl.store(children + item * rows * columns + child, total, inside)
 
