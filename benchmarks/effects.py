@@ -272,7 +272,8 @@ def plot(result: dict[str, Any], path: Path) -> None:
     left.set_xlabel("time saved without it, %")
     left.set_ylabel("largest difference it makes, JND")
     left.set_title("One effect left out, each pair", fontsize=10)
-    left.legend(fontsize=8, frameon=False)
+    # Within the plot its marks would look like data.
+    figure.legend(loc="outside lower center", ncols=len(EFFECTS), fontsize=8, frameon=False)
     draw_times(right, list(pairs_of), list(map(times_as_fast, pairs_of.values())))
     right.set_xscale("log")
     right.set_title("Nothing lost", fontsize=10)
